@@ -1,0 +1,3 @@
+"""Set-up, demonstration, composition and benchmarks of the PCW packages."""
+
+__all__: list[str] = []

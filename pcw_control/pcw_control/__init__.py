@@ -1,0 +1,3 @@
+"""Controllers for powered-caster robots: computed torque, quintic trajectories and torque limits."""
+
+__all__: list[str] = []

@@ -1,0 +1,49 @@
+"""Standard ament_python build of pcw_description."""
+
+from glob import glob
+from os.path import dirname, isfile, join
+
+from setuptools import find_packages, setup
+
+package_name = "pcw_description"
+
+
+def share_files(folder):
+    """Return data_files entries that install `folder`, sub-folders included, under share/<package>."""
+    by_folder = {}
+    for path in sorted(glob(join(folder, "**", "*"), recursive=True)):
+        if isfile(path) and "__pycache__" not in path:
+            by_folder.setdefault(join("share", package_name, dirname(path)), []).append(path)
+    return sorted(by_folder.items())
+
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*", "tests", "tests.*"]),
+    package_data={"": ["*.css", "*.html", "*.j2", "*.js", "*.svg", "*.yaml", "py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/" + package_name]),
+        ("share/" + package_name, ["package.xml"]),
+        *share_files("config"),
+        *share_files("launch"),
+    ],
+    python_requires=">=3.11",
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    zip_safe=False,
+    maintainer="PCW maintainers",
+    maintainer_email="pcw-maintainers@example.org",
+    description=(
+        "Robot description format pcw_robot/1, kinematics, dynamics, contact models, physics "
+        "effects and recordings of powered-caster robots."
+    ),
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "robot_description = pcw_description.nodes.robot_description:main",
+            "urdf = pcw_description.urdf:main",
+            "validate = pcw_description.validate:main",
+        ],
+    },
+)

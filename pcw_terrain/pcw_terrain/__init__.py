@@ -1,0 +1,3 @@
+"""Terrain for powered-caster robots: the catalogue of grounds."""
+
+__all__: list[str] = []
