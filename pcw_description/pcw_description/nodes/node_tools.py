@@ -1,0 +1,379 @@
+"""What every PCW node shares: running it, its parameters, its stamps, its QoS and its JointStates.
+
+A node's file needs no more than this:
+
+    class OdometryNode(Node):
+        def __init__(self) -> None:
+            super().__init__("odometry")
+            self._rate = declare(self, "rate", 100.0, "publishing rate", unit="Hz", range=(1.0, 1000.0))
+
+        def close(self) -> None:               # optional: last words while publishing still works
+            self._commands.publish(zero_torque)
+
+    def main(args: list[str] | None = None) -> int:
+        return run_node(OdometryNode, args)
+"""
+
+from __future__ import annotations
+
+import array
+import math
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import rclpy
+from builtin_interfaces.msg import Time
+from numpy.typing import ArrayLike
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+
+from pcw_description.errors import PcwError, nearest_name
+
+try:
+    from rclpy.experimental.events_executor import EventsExecutor
+except ImportError:  # older Jazzy patch releases do not have it
+    EventsExecutor = SingleThreadedExecutor
+
+NANOSECONDS = 1_000_000_000
+# A signal that arrives while the executor sleeps is seen when it wakes, so this is the latency of a shutdown.
+SPIN_TIMEOUT = 0.1  # [s]
+
+
+# --- Running --------------------------------------------------------------------------------------------
+
+
+def run_node(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """Make the node, spin it until a signal or a shutdown, close and destroy it. Returns the exit code.
+
+    0 after SIGINT, SIGTERM or a shutdown from outside; 2 with one line on stderr for bad input (`PcwError`, a
+    refused parameter); 1 with a traceback for anything else. A node's `close()` runs first of all, while it
+    can still publish, also after an exception.
+    """
+    return run_nodes([factory], args)
+
+
+def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
+    """As `run_node`, for several nodes in one process and one executor."""
+    # rclpy's own signal handlers invalidate the context at once, so that no last command (zero torque) could
+    # be sent and no file be closed in order: ours only take a note.
+    rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+    nodes: list[Node] = []
+    exit_code = 0
+    with _stop_requests() as stop_requests:
+        try:
+            for factory in factories:
+                nodes.append(factory())
+                _warn_of_unknown_overrides(nodes[-1])
+            _spin(nodes, stop_requests)
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        except (PcwError, ParameterException) as error:
+            print(f"{_program_name()}: {error}", file=sys.stderr)
+            exit_code = 2
+        except Exception:
+            traceback.print_exc()
+            exit_code = 1
+        finally:
+            for node in reversed(nodes):
+                exit_code = max(exit_code, _close(node))
+                node.destroy_node()
+            rclpy.try_shutdown()
+    return exit_code
+
+
+def spin_until_shutdown(*nodes: Node) -> None:
+    """Spin until SIGINT or SIGTERM arrives, or until the context is shut down by somebody else.
+
+    A signal more than a second after the first raises KeyboardInterrupt, for a callback that never ends.
+    """
+    with _stop_requests() as stop_requests:
+        _spin(nodes, stop_requests)
+
+
+def _spin(nodes: Iterable[Node], stop_requests: list[float]) -> None:
+    executor = make_executor()
+    try:
+        for node in nodes:
+            executor.add_node(node)
+        # EventsExecutor.spin() of Jazzy may spin without calling anything; spin_once() is sound.
+        while rclpy.ok() and not stop_requests:
+            executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+    finally:
+        executor.shutdown()
+
+
+def make_executor() -> Executor:
+    """An EventsExecutor (at most half the cost) where this Jazzy has it, else a SingleThreadedExecutor."""
+    return EventsExecutor()
+
+
+@contextmanager
+def _stop_requests() -> Iterator[list[float]]:
+    """Collect the times of SIGINT and SIGTERM in a list instead of letting them end the process."""
+    received: list[float] = []
+
+    def request_stop(number: int, frame: FrameType | None) -> None:
+        received.append(time.monotonic())
+        # a terminal and a parent may both deliver the same Ctrl-C, so only a later one is an insistent one
+        if received[-1] - received[0] > 1.0:
+            raise KeyboardInterrupt
+
+    try:
+        previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not in the main thread (a test that spins a node): whoever started it stops it
+        previous = {}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _close(node: Node) -> int:
+    close = getattr(node, "close", None)
+    if close is None:
+        return 0
+    try:
+        close()
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def _program_name() -> str:
+    return sys.argv[0].rsplit("/", 1)[-1].removesuffix(".py") or "node"
+
+
+# --- Parameters -----------------------------------------------------------------------------------------
+
+Check = Callable[[Any], str | None]
+_CHECKS_ATTRIBUTE = "_pcw_parameter_checks"
+
+
+def declare(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    unit: str = "",
+    range: tuple[float, float] | None = None,  # noqa: A002 - the word ROS uses for it
+    read_only: bool = False,
+    choices: Sequence[Any] | None = None,
+    check: Check | None = None,
+) -> Any:
+    """Declare a parameter with a full descriptor and return its value (an override included).
+
+    The type is that of `default`; for an empty list give the type itself, `Parameter.Type.STRING_ARRAY`, and
+    the value without an override is []. A value that is not finite, out of `range` (ends included), not
+    among `choices`, or for which `check(value)` returns a reason is refused with that reason, now and
+    later, and the old value stays. A bad override raises rclpy's InvalidParameterValueException or
+    InvalidParameterTypeException.
+    """
+    descriptor = ParameterDescriptor(
+        description=f"{description} [{unit}]" if unit else description, read_only=read_only
+    )
+    if range is not None:
+        _set_range(descriptor, default, range)
+    if choices is not None:
+        descriptor.additional_constraints = "one of " + ", ".join(str(choice) for choice in choices)
+    _checks_of(node)[name] = _combined_check(unit, range, choices, check)
+    if not isinstance(default, Parameter.Type):
+        return node.declare_parameter(name, default, descriptor).value
+    parameter = node.declare_parameter(name, default, descriptor)
+    return [] if parameter.value is None else parameter.value
+
+
+def _set_range(descriptor: ParameterDescriptor, default: Any, range: tuple[float, float]) -> None:  # noqa: A002
+    low, high = range
+    if isinstance(default, int) and not isinstance(default, bool):
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+    elif isinstance(default, float):
+        bounds = FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        descriptor.floating_point_range = [bounds]
+    else:  # an array: ROS keeps no range for it, so it stands in words and _combined_check enforces it
+        descriptor.additional_constraints = f"each from {low} to {high}"
+
+
+def _combined_check(
+    unit: str,
+    range: tuple[float, float] | None,  # noqa: A002
+    choices: Sequence[Any] | None,
+    check: Check | None,
+) -> Check:
+    def reason_to_refuse(value: Any) -> str | None:
+        is_list = isinstance(value, (list, tuple, array.array, np.ndarray))
+        for entry in value if is_list else [value]:
+            if isinstance(entry, float) and not math.isfinite(entry):
+                return f"{entry} is not a finite number"
+            if range is not None and not range[0] <= entry <= range[1]:
+                return f"{entry} is outside {range[0]} .. {range[1]}{' ' if unit else ''}{unit}"
+            if choices is not None and entry not in choices:
+                return f"{entry!r} is not known; {nearest_name(str(entry), map(str, choices))}"
+        return check(value) if check is not None else None
+
+    return reason_to_refuse
+
+
+def _checks_of(node: Node) -> dict[str, Check]:
+    """The checks by parameter name, kept at the node; the first call installs the callback that uses them."""
+    checks: dict[str, Check] | None = getattr(node, _CHECKS_ATTRIBUTE, None)
+    if checks is not None:
+        return checks
+    installed: dict[str, Check] = {}
+
+    def refuse_bad_values(parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            check = installed.get(parameter.name)
+            if check is None or parameter.type_ is Parameter.Type.NOT_SET:
+                continue
+            reason = check(parameter.value)
+            if reason is not None:
+                return SetParametersResult(successful=False, reason=f"{parameter.name}: {reason}")
+        return SetParametersResult(successful=True)
+
+    setattr(node, _CHECKS_ATTRIBUTE, installed)
+    node.add_on_set_parameters_callback(refuse_bad_values)
+    return installed
+
+
+def _warn_of_unknown_overrides(node: Node) -> None:
+    """Say which given parameters the node does not know.
+
+    A warning and not an error, because a parameter file with `/**` is read by every node of the process.
+    """
+    overrides: Mapping[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    for name in overrides:
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            known = getattr(node, _CHECKS_ATTRIBUTE, {})
+            hint = f"; {nearest_name(name, known)}" if known else ""
+            node.get_logger().warning(f"parameter {name!r} is unknown to this node and ignored{hint}")
+
+
+# --- Stamps ---------------------------------------------------------------------------------------------
+
+
+def stamp_to_ns(stamp: Time) -> int:
+    """Nanoseconds of a header stamp."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def ns_to_stamp(nanoseconds: int) -> Time:
+    """Header stamp of a time in nanoseconds."""
+    seconds, rest = divmod(int(nanoseconds), NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+class StampWatch:
+    """Measures dt between the stamps of one stream and counts what is wrong with them.
+
+    `update(stamp)` returns dt [s] since the stamp before, or None for the first stamp, a repeated stamp, a
+    jump back, or a gap longer than `longest_gap` [s]; the next dt is then measured from this stamp.
+    """
+
+    def __init__(self, longest_gap: float = 0.5) -> None:
+        self.longest_gap = longest_gap
+        self.repeats = 0
+        self.backward_jumps = 0
+        self.gaps = 0
+        self._last_ns: int | None = None
+
+    def update(self, stamp: Time) -> float | None:
+        now_ns = stamp_to_ns(stamp)
+        last_ns, self._last_ns = self._last_ns, now_ns
+        if last_ns is None:
+            return None
+        dt = (now_ns - last_ns) * 1e-9
+        if dt == 0.0:
+            self.repeats += 1
+        elif dt < 0.0:
+            self.backward_jumps += 1
+        elif dt > self.longest_gap:
+            self.gaps += 1
+        else:
+            return dt
+        return None
+
+
+# --- Quality of service ---------------------------------------------------------------------------------
+
+
+def _profile(reliability: ReliabilityPolicy, durability: DurabilityPolicy, depth: int) -> QoSProfile:
+    return QoSProfile(
+        reliability=reliability, durability=durability, history=HistoryPolicy.KEEP_LAST, depth=depth
+    )
+
+
+# REP-2003: who reads a sensor does not insist on old samples; who sends one offers reliable delivery, so that
+# both kinds of reader connect.
+SENSOR = _profile(ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE, 10)
+SENSOR_SOURCE = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 10)
+# Only the newest command counts.
+COMMAND = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 1)
+# Late joiners get the last sample (maps, descriptions, static facts).
+LATCHED = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL, 1)
+
+
+# --- Joint states ---------------------------------------------------------------------------------------
+
+
+def fill_joint_state(
+    message: JointState,
+    position: ArrayLike | None = None,
+    velocity: ArrayLike | None = None,
+    effort: ArrayLike | None = None,
+) -> tuple[str, ...]:
+    """Fill the three fields from (n, 2) or (2n,) arrays in the order of `message.name`.
+
+    Names and stamp are the caller's. NaN never leaves a node: a field that holds a value that is not finite
+    is left empty. Returns the names of the fields left out for that reason, () when all is well. PcwError
+    when a length differs from the names.
+    """
+    refused = []
+    for field, values in (("position", position), ("velocity", velocity), ("effort", effort)):
+        if values is None:
+            setattr(message, field, [])
+            continue
+        flat = np.asarray(values, dtype=np.float64)
+        if flat.size != len(message.name):
+            raise PcwError(f"JointState {field}: {flat.size} values for {len(message.name)} names")
+        if not np.isfinite(flat).all():
+            refused.append(field)
+            setattr(message, field, [])
+            continue
+        # array.array passes the message's type check as a whole, a list would be checked value by value
+        setattr(message, field, array.array("d", flat.tobytes()))
+    return tuple(refused)
+
+
+def joint_state_arrays(
+    message: JointState, joint_index: Mapping[str, int], shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position, velocity and effort of a message as arrays of `shape`, e.g. (n, 2); NaN where not sent.
+
+    `joint_index` maps a joint's name to its place in the flattened array: {name: i for i, name in
+    enumerate(robot.joint_names)}. Joints that are not in it are skipped.
+    """
+    count = math.prod(shape)
+    arrays = []
+    for values in (message.position, message.velocity, message.effort):
+        flat = np.full(count, np.nan)
+        for name, value in zip(message.name, values):  # noqa: B905 - an empty or short field is legal
+            index = joint_index.get(name)
+            if index is not None:
+                flat[index] = value
+        arrays.append(flat.reshape(shape))
+    return arrays[0], arrays[1], arrays[2]
