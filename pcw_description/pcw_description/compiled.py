@@ -1,0 +1,65 @@
+"""The one way this project compiles inner loops: numba where it is installed, plain Python where it is not.
+
+Plain Python gives the same numbers, only slower, so a machine without numba still runs every node.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+try:
+    import numba
+    from numba.core.errors import NumbaExperimentalFeatureWarning
+
+    NUMBA_AVAILABLE = True
+    warnings.filterwarnings("ignore", category=NumbaExperimentalFeatureWarning)
+except ImportError:  # pragma: no cover - exercised on machines without numba
+    NUMBA_AVAILABLE = False
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+# Signature of every joint-torque kernel: (position [rad], velocity [rad/s], motor_torque [N m],
+# normal_force [N], parameters) -> torque [N m]. One signature lets a compiled plant call any list of effects
+# through function pointers, so that adding an effect does not compile the plant again.
+JOINT_TORQUE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
+
+
+def compiled(function: Function) -> Function:
+    """Compile `function` to machine code, cached on disk; a division by zero gives inf or nan, as in numpy."""
+    if not NUMBA_AVAILABLE:
+        return function
+    return numba.njit(cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+
+
+def compiled_joint_torque(function: Function) -> Function:
+    """Compile a joint-torque kernel with the common signature `JOINT_TORQUE_SIGNATURE`."""
+    if not NUMBA_AVAILABLE:
+        return function
+    return numba.njit(JOINT_TORQUE_SIGNATURE, cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+
+
+def joint_torque_list(functions: Sequence[Callable[..., float]]) -> Any:
+    """A list of joint-torque kernels that compiled code can call, empty lists included."""
+    if not NUMBA_AVAILABLE:
+        return list(functions)
+    kernel_type = numba.types.FunctionType(
+        numba.types.float64(*[numba.types.float64] * 4, numba.types.float64[::1])
+    )
+    typed_list = numba.typed.List.empty_list(kernel_type)
+    for function in functions:
+        typed_list.append(function)
+    return typed_list
+
+
+@compiled
+def joint_torque_along(kernels, position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
+    """Evaluate the first kernel of a `joint_torque_list` along arrays (T,); returns (T,) [N m]."""
+    kernel = kernels[0]
+    torque = position.copy()
+    for index in range(len(position)):
+        torque[index] = kernel(
+            position[index], velocity[index], motor_torque[index], normal_force[index], parameters
+        )
+    return torque

@@ -1,0 +1,1 @@
+"""Tyre-ground contact: one interface (`contact_model`), one file per friction curve."""

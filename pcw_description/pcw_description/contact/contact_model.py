@@ -1,0 +1,130 @@
+"""One interface for all tyres: relaxed slip, combined slip on a friction ellipse, scrub; (3.43)-(3.47) [Li2009].
+
+The slip ratio is singular at standstill. Its relaxed form is not:
+
+    z_dot = eps - (V / L) z,    lambda = z / L,    V = max(|r rho_dot|, |v_wheel|)
+
+with the slip velocity eps, and the relaxation length L; in steady rolling lambda = eps / V. It is integrated
+implicitly, and the force uses z + DAMPING_TIME z_dot, which damps the tyre's spring at standstill and is nothing in
+steady motion. Longitudinal and lateral slip, each relative to its own critical slip, combine in an ellipse.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..compiled import compiled
+from ..robot_description import ContactDescription, FloatArray
+from . import burckhardt, dugoff, kiencke, lugre, magic_formula
+
+MODELS = {"kiencke": kiencke, "magic_formula": magic_formula, "dugoff": dugoff, "burckhardt": burckhardt, "lugre": lugre}
+_KIENCKE, _MAGIC_FORMULA, _DUGOFF, _BURCKHARDT, _LUGRE = range(len(MODELS))
+
+# Layout of the numbers of one tyre, shape (TYRE_SIZE,).
+MODEL, MU, LAMBDA, A, B, C, LATERAL_MU, LATERAL_LAMBDA, LATERAL_A, LATERAL_B, LATERAL_C, LENGTH, SCRUB = range(13)
+TYRE_SIZE = 13
+
+# Damping of the bristles at standstill [s]; see the module's docstring. A fifth of critical for a 20 kg wheel load.
+DAMPING_TIME = 0.002
+# Below this rolling speed turning on the spot counts as full scrub [m/s].
+SCRUB_SPEED = 0.05
+
+
+def tyre_parameters(contact: ContactDescription) -> FloatArray:
+    """Return the numbers of a tyre as the kernels take them, (TYRE_SIZE,).
+
+    Raises:
+        DescriptionError: shape numbers that the model does not know or that have no meaning.
+    """
+    module = MODELS[contact.model]
+    tyre = np.empty(TYRE_SIZE)
+    tyre[MODEL] = list(MODELS).index(contact.model)
+    tyre[[MU, LAMBDA]] = contact.mu_p, contact.lambda_p
+    tyre[[A, B, C]] = module.shape_numbers(contact.mu_p, contact.lambda_p, contact.shape)
+    lateral = contact.lateral
+    tyre[[LATERAL_MU, LATERAL_LAMBDA]] = lateral.mu_p, lateral.lambda_p
+    tyre[[LATERAL_A, LATERAL_B, LATERAL_C]] = module.shape_numbers(lateral.mu_p, lateral.lambda_p, contact.shape)
+    tyre[LENGTH], tyre[SCRUB] = contact.relaxation_length, contact.scrub_radius
+    return tyre
+
+
+@compiled
+def _curve(model, slip, mu_p, lambda_p, a, b, c):  # type: ignore[no-untyped-def]
+    if model == _KIENCKE:
+        return kiencke.friction(slip, mu_p, lambda_p, a, b, c)
+    if model == _MAGIC_FORMULA:
+        return magic_formula.friction(slip, mu_p, lambda_p, a, b, c)
+    if model == _DUGOFF:
+        return dugoff.friction(slip, mu_p, lambda_p, a, b, c)
+    if model == _BURCKHARDT:
+        return burckhardt.friction(slip, mu_p, lambda_p, a, b, c)
+    return lugre.friction(slip, mu_p, lambda_p, a, b, c)
+
+
+@compiled
+def friction_coefficient(tyre, longitudinal_slip, lateral_slip):  # type: ignore[no-untyped-def]
+    """Return the friction coefficients (longitudinal, lateral) [1] of combined steady slip.
+
+    Args:
+        tyre: numbers of the tyre (TYRE_SIZE,).
+        longitudinal_slip: lambda [1], positive for traction.
+        lateral_slip: the same across, eps_y / V [1].
+    """
+    model = int(tyre[MODEL])
+    sx, sy = longitudinal_slip / tyre[LAMBDA], lateral_slip / tyre[LATERAL_LAMBDA]
+    s = math.sqrt(sx * sx + sy * sy)
+    if s < 1e-12:
+        return 0.0, 0.0
+    along = _curve(model, s * tyre[LAMBDA], tyre[MU], tyre[LAMBDA], tyre[A], tyre[B], tyre[C])
+    across = _curve(
+        model, s * tyre[LATERAL_LAMBDA], tyre[LATERAL_MU], tyre[LATERAL_LAMBDA], tyre[LATERAL_A], tyre[LATERAL_B], tyre[LATERAL_C]
+    )
+    return along * sx / s, across * sy / s
+
+
+@compiled
+def tyre_step(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type: ignore[no-untyped-def]
+    """Advance one tyre by dt.
+
+    Args:
+        tyre: numbers of the tyre (TYRE_SIZE,).
+        z_x, z_y: relaxed slip [m].
+        slip_x, slip_y: slip velocity eps [m/s].
+        speed: max(|r rho_dot|, |v_wheel|) [m/s].
+        normal_force: F_z >= 0 [N].
+        dt: step [s].
+
+    Returns:
+        New z_x, z_y [m] and the force of the ground on the wheel F_x, F_y in the wheel frame [N].
+    """
+    length = tyre[LENGTH]
+    loss = speed / length
+    if int(tyre[MODEL]) == _LUGRE:
+        slip_speed = math.sqrt(slip_x * slip_x + slip_y * slip_y)
+        stiffness = tyre[A] / length
+        sliding = lugre.sliding_friction(slip_speed, tyre[MU], tyre[B], tyre[C])
+        loss += stiffness * slip_speed / sliding
+    new_x = (z_x + dt * slip_x) / (1.0 + dt * loss)
+    new_y = (z_y + dt * slip_y) / (1.0 + dt * loss)
+    damping = DAMPING_TIME / dt
+    lambda_x = (new_x + damping * (new_x - z_x)) / length
+    lambda_y = (new_y + damping * (new_y - z_y)) / length
+    if int(tyre[MODEL]) == _LUGRE:
+        return new_x, new_y, tyre[A] * lambda_x * normal_force, tyre[LATERAL_A] * lambda_y * normal_force
+    along, across = friction_coefficient(tyre, lambda_x, lambda_y)
+    return new_x, new_y, along * normal_force, across * normal_force
+
+
+@compiled
+def scrub_torque(tyre, turn_rate, speed, normal_force):  # type: ignore[no-untyped-def]
+    """Return the torque of the ground on the wheel about the vertical [N m], against its turn rate over ground [rad/s].
+
+    The patch's edge slips at turn_rate times the scrub radius; relative to the rolling speed that is its slip ratio.
+    """
+    radius = tyre[SCRUB]
+    if radius == 0.0:
+        return 0.0
+    slip = turn_rate * radius / max(speed, SCRUB_SPEED) / tyre[LAMBDA]
+    return -tyre[MU] * normal_force * radius * slip / math.sqrt(1.0 + slip * slip)

@@ -1,0 +1,31 @@
+"""Cogging of the drive motor: a torque periodic in the angle of the joint."""
+
+import math
+
+from ..compiled import compiled_joint_torque
+from .effect import EffectParameter, JointTorqueEffect
+
+
+@compiled_joint_torque
+def cogging_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+    """Return cosine cos(k q) + sine sin(k q), k periods per radian of the joint [N m]."""
+    angle = parameters[2] * position
+    return parameters[0] * math.cos(angle) + parameters[1] * math.sin(angle)
+
+
+EFFECT = JointTorqueEffect(
+    name="motor_cogging",
+    target_kind="caster",
+    axis="drive",
+    summary="Torque ripple tied to the angle of the motor: magnets pulling on the slots.",
+    sentence="Cogging of order {order:.4g} per radian with cosine {cosine:.3g} and sine {sine:.3g} N m in the drive of {target}.",
+    parameters=(
+        EffectParameter("cosine", "N m", "cosine part of the ripple", -1e4, 1e4, 0.2, linear=True),
+        EffectParameter("sine", "N m", "sine part of the ripple", -1e4, 1e4, 0.2, default=0.0, linear=True),
+        EffectParameter("order", "1/rad", "ripple periods per turn of the joint", 0.05, 1e5, 40.0),
+    ),
+    sensors=("joint_states",),
+    look_alikes=("wheel_eccentricity",),
+    separating_experiment="turn slowly over many revolutions in both directions, at two speeds",
+    torque=cogging_torque,
+)

@@ -1,0 +1,84 @@
+"""Finds every effect: the files of this folder, and entry points of other packages. Adding one edits no list."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.metadata
+import pkgutil
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..errors import DescriptionError, nearest_name
+from .effect import Effect, EffectInstance
+
+ENTRY_POINT_GROUP = "pcw_description.effects"
+_NOT_EFFECTS = ("effect", "registry")
+
+
+@functools.cache
+def all_effects() -> Mapping[str, Effect]:
+    """Return every effect by name, sorted."""
+    package = importlib.import_module(__package__ or "pcw_description.effects")
+    effects: dict[str, Effect] = {}
+    for module_info in pkgutil.iter_modules(package.__path__):
+        if module_info.name not in _NOT_EFFECTS:
+            effect = importlib.import_module(f"{package.__name__}.{module_info.name}").EFFECT
+            effects[effect.name] = effect
+    for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
+        effect = entry_point.load()
+        effects[effect.name] = effect
+    return dict(sorted(effects.items()))
+
+
+def get(name: str) -> Effect:
+    """Return one effect.
+
+    Raises:
+        DescriptionError: there is none of that name; the nearest is suggested.
+    """
+    effects = all_effects()
+    if name not in effects:
+        raise DescriptionError("physics.name", name, f"unknown effect; {nearest_name(str(name), effects)}")
+    return effects[name]
+
+
+def read_physics(entries: object, caster_names: Sequence[str]) -> tuple[EffectInstance, ...]:
+    """Read the `physics:` list of a description.
+
+    Args:
+        entries: list of mappings with `name`, `target` and the effect's parameters.
+        caster_names: the casters that may be targets.
+
+    Raises:
+        DescriptionError: unknown effect, unknown target, missing or out-of-range parameter.
+    """
+    if not isinstance(entries, (list, tuple)):
+        raise DescriptionError("physics", entries, "allowed: a list of effects")
+    instances = []
+    for index, entry in enumerate(entries):
+        where = f"physics[{index}]"
+        if not isinstance(entry, Mapping) or "name" not in entry:
+            raise DescriptionError(where, entry, "allowed: a mapping with name, target and parameters")
+        name = entry["name"]
+        effects = all_effects()
+        if name not in effects:
+            raise DescriptionError(f"{where}.name", name, f"unknown effect; {nearest_name(str(name), effects)}")
+        effect = effects[name]
+        target = _read_target(entry.get("target"), effect, caster_names, where)
+        parameters: dict[str, Any] = {str(k): v for k, v in entry.items() if k not in ("name", "target")}
+        instances.append(EffectInstance(effect.name, target, effect.check(parameters, where)))
+    return tuple(instances)
+
+
+def _read_target(target: object, effect: Effect, caster_names: Sequence[str], where: str) -> tuple[str, ...]:
+    allowed = tuple(caster_names) if effect.target_kind == "caster" else (effect.target_kind,)
+    if target is None:
+        return allowed
+    names = (target,) if isinstance(target, str) else tuple(target) if isinstance(target, (list, tuple)) else None
+    if not names:
+        raise DescriptionError(f"{where}.target", target, f"allowed: a list out of {', '.join(allowed)}")
+    for name in names:
+        if name not in allowed:
+            raise DescriptionError(f"{where}.target", name, nearest_name(str(name), allowed))
+    return tuple(str(name) for name in names)

@@ -1,0 +1,567 @@
+"""The robot description format `pcw_robot/1`: the single source of numbers for nodes, simulators, URDF and analyser.
+
+Conventions (EQUATIONS in `SYMBOLS.md`): SI units, `base_link` with x forward, y left, z up and its origin on the
+ground below the reference point of the robot. Joint arrays have the shape (n, 2): the first index is the caster in
+the order of the file, the second is `DRIVE` or `STEER`. Contact arrays use `LONGITUDINAL` and `LATERAL` likewise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from .description_fields import load_yaml_mapping, quantity, read_section, section, text
+from .effects.effect import EffectInstance
+from .effects.registry import read_physics
+from .errors import DescriptionError, KinematicsError, nearest_name
+
+FORMAT = "pcw_robot/1"
+DRIVE, STEER = 0, 1
+LONGITUDINAL, LATERAL = 0, 1
+AXIS_NAMES = ("drive", "steer")
+CONTACT_MODELS = ("kiencke", "magic_formula", "dugoff", "burckhardt", "lugre")
+
+# Two steering axes closer than this are one axis: no module of these robots is this thin.
+MINIMUM_AXIS_DISTANCE = 0.01
+# Below this offset steering cannot push the wheel sideways with a usable torque.
+MINIMUM_CASTER_OFFSET = 1e-3
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Chassis:
+    """Everything that does not turn with a caster."""
+
+    mass: float = quantity("kg", "mass without the caster modules", above=0.0, maximum=1e5)
+    inertia_zz: float = quantity("kg m^2", "inertia about the vertical through the centre of mass", above=0.0, maximum=1e6)
+    com: tuple[float, float, float] = quantity(
+        "m", "centre of mass in base_link; z above the ground", length=3, minimum=-10.0, maximum=10.0,
+        hint="a larger value may be in mm",
+    )
+    size: tuple[float, float, float] = quantity(
+        "m", "length, width, height of the body, for looks and default inertias", length=3, above=0.0, maximum=20.0
+    )
+    inertia_xx: float | None = quantity("kg m^2", "inertia about x; default: a box of `size`", above=0.0, default=None)
+    inertia_yy: float | None = quantity("kg m^2", "inertia about y; default: a box of `size`", above=0.0, default=None)
+
+    def principal_inertias(self) -> tuple[float, float, float]:
+        """Return (I_xx, I_yy, I_zz) about the centre of mass [kg m^2], with box defaults filled in."""
+        length, width, height = self.size
+        box_xx = self.mass * (width**2 + height**2) / 12.0
+        box_yy = self.mass * (length**2 + height**2) / 12.0
+        # A box of that size may contradict the stated I_zz; stretching the two keeps the triangle inequality.
+        stretch = max(1.0, 1.001 * self.inertia_zz / (box_xx + box_yy))
+        return (
+            self.inertia_xx if self.inertia_xx is not None else box_xx * stretch,
+            self.inertia_yy if self.inertia_yy is not None else box_yy * stretch,
+            self.inertia_zz,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Module:
+    """The part of a caster that turns about the steering axis: fork, wheel and what hangs on them."""
+
+    mass: float = quantity("kg", "mass of fork and wheel together", above=0.0, maximum=1e4)
+    inertia_zz: float = quantity(
+        "kg m^2", "inertia of fork and wheel about the vertical through their centre of mass", above=0.0, maximum=1e4
+    )
+    com: tuple[float, float] = quantity(
+        "m", "centre of mass in the wheel frame, from the steering axis", length=2, minimum=-1.0, maximum=1.0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Wheel:
+    """The rolling part; its mass is part of the module's mass."""
+
+    mass: float = quantity("kg", "mass of the wheel", above=0.0, maximum=1e4)
+    inertia_axle: float = quantity("kg m^2", "inertia about the axle, without the motor", above=0.0, maximum=1e4)
+    width: float = quantity("m", "width of the tread", above=0.0, maximum=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gears:
+    """Motor angle = matrix times joint angle: drive motor = drive * rho + drive_per_steer * phi, and likewise steer."""
+
+    drive: float = quantity("1", "turns of the drive motor per turn of the wheel", minimum=-1e4, maximum=1e4)
+    steer: float = quantity("1", "turns of the steering motor per turn of the steering axis", minimum=-1e4, maximum=1e4)
+    drive_per_steer: float = quantity(
+        "1", "turns of the drive motor per turn of the steering axis (coupling)", default=0.0, minimum=-1e4, maximum=1e4
+    )
+    steer_per_drive: float = quantity(
+        "1", "turns of the steering motor per turn of the wheel (coupling)", default=0.0, minimum=-1e4, maximum=1e4
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Rotors:
+    """Inertias of the rotors about their own axes, motor side."""
+
+    drive: float = quantity("kg m^2", "rotor inertia of the drive motor, motor side", minimum=0.0, maximum=10.0)
+    steer: float = quantity("kg m^2", "rotor inertia of the steering motor, motor side", minimum=0.0, maximum=10.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Limits of one caster, on the joint side of the gears."""
+
+    drive_torque: float = quantity("N m", "largest drive torque, joint side", above=0.0, maximum=1e5)
+    steer_torque: float = quantity("N m", "largest steering torque, joint side", above=0.0, maximum=1e5)
+    drive_speed: float = quantity(
+        "rad/s", "largest wheel speed", above=0.0, maximum=300.0, hint="a larger value may be in rpm or deg/s"
+    )
+    steer_speed: float = quantity(
+        "rad/s", "largest steering speed", above=0.0, maximum=100.0, hint="a larger value may be in rpm or deg/s"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Caster:
+    """One powered caster wheel."""
+
+    name: str = text("name of the caster; its joints are <name>_steer and <name>_drive")
+    steer_axis: tuple[float, float] = quantity(
+        "m", "steering axis in base_link", length=2, minimum=-10.0, maximum=10.0, hint="a larger value may be in mm"
+    )
+    caster_offset: tuple[float, float] = quantity(
+        "m", "steering axis to wheel centre in the wheel frame (b_x, b_y); a trailing wheel has b_x < 0", length=2,
+        minimum=-1.0, maximum=1.0, hint="a larger value may be in mm",
+    )
+    wheel_radius: float = quantity("m", "rolling radius", above=0.0, maximum=1.0, hint="a larger value may be in mm")
+    module: Module = section("fork and wheel, turning about the steering axis")
+    wheel: Wheel = section("the rolling part")
+    gears: Gears = section("gear ratios and coupling")
+    rotors: Rotors = section("rotor inertias")
+    limits: Limits = section("limits of torque and speed")
+
+
+@dataclasses.dataclass(frozen=True)
+class LateralContact:
+    """Friction across the rolling direction."""
+
+    mu_p: float = quantity("1", "peak friction coefficient, lateral", above=0.0, maximum=5.0)
+    lambda_p: float = quantity("1", "slip at the peak, lateral (tangent of the slip angle)", above=0.0, maximum=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactDescription:
+    """The nominal ground and the tyre on it."""
+
+    model: str = text("friction curve", choices=CONTACT_MODELS)
+    mu_p: float = quantity("1", "peak friction coefficient", above=0.0, maximum=5.0)
+    lambda_p: float = quantity("1", "slip ratio at the peak", above=0.0, maximum=1.0, hint="a larger value may be in percent")
+    lateral: LateralContact = section("the same across the rolling direction")
+    relaxation_length: float = quantity("m", "rolled distance over which the tyre force builds up", above=0.0, maximum=1.0)
+    scrub_radius: float = quantity(
+        "m", "effective radius of the contact patch for turning on the spot; 0 = a point", minimum=0.0, maximum=0.2,
+        default=0.0,
+    )
+    shape: dict[str, float] = section("further numbers of the friction curve, by name", default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Encoders:
+    """Encoders on the motors."""
+
+    drive_counts: float = quantity("counts/rev", "counts per turn of the drive motor", above=0.0, maximum=1e9)
+    steer_counts: float = quantity("counts/rev", "counts per turn of the steering motor", above=0.0, maximum=1e9)
+    rate: float = quantity("Hz", "rate of joint_states", above=0.0, maximum=2e4)
+    velocity_noise: float = quantity("rad/s", "standard deviation of measured joint speed", minimum=0.0, default=0.0)
+    torque_noise: float = quantity("N m", "standard deviation of measured motor torque, joint side", minimum=0.0, default=0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImuDescription:
+    """Inertial measurement unit, axes parallel to base_link."""
+
+    position: tuple[float, float, float] = quantity("m", "position in base_link", length=3, minimum=-10.0, maximum=10.0)
+    rate: float = quantity("Hz", "rate of imu/data", above=0.0, maximum=2e4)
+    gyro_noise: float = quantity("rad/s", "standard deviation of one sample", minimum=0.0, maximum=1.0)
+    accelerometer_noise: float = quantity("m/s^2", "standard deviation of one sample", minimum=0.0, maximum=10.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackerDescription:
+    """Whatever measures the true pose: a motion tracker, or the simulator itself."""
+
+    rate: float = quantity("Hz", "rate of ground_truth/odom", above=0.0, maximum=2e4)
+    position_noise: float = quantity("m", "standard deviation of one sample", minimum=0.0, maximum=1.0, default=0.0)
+    yaw_noise: float = quantity("rad", "standard deviation of one sample", minimum=0.0, maximum=1.0, default=0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensors:
+    """What the robot measures."""
+
+    encoders: Encoders = section("encoders and joint_states")
+    imu: ImuDescription | None = section("inertial measurement unit; leave out where there is none", default=None)
+    tracker: TrackerDescription | None = section("external pose; leave out where there is none", default=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """How far a healthy robot may differ from its description: one standard deviation.
+
+    Attributes:
+        value: the deviation, as a fraction of the nominal number if `relative`, else in `unit`.
+    """
+
+    value: float
+    unit: str
+    relative: bool
+
+    def __str__(self) -> str:
+        return f"{self.value * 100:g} %" if self.relative else f"{self.value:g} {self.unit}"
+
+
+# Defaults: careful workshop practice. A robot file overrides them where its builder knows better.
+DEFAULT_TOLERANCES: Mapping[str, Tolerance] = {
+    "chassis.mass": Tolerance(0.01, "kg", True),
+    "chassis.inertia_zz": Tolerance(0.05, "kg m^2", True),
+    "chassis.com": Tolerance(0.005, "m", False),
+    "module.mass": Tolerance(0.01, "kg", True),
+    "module.inertia_zz": Tolerance(0.05, "kg m^2", True),
+    "wheel.inertia_axle": Tolerance(0.05, "kg m^2", True),
+    "rotors": Tolerance(0.05, "kg m^2", True),
+    "wheel_radius": Tolerance(0.001, "m", True),
+    "caster_offset": Tolerance(0.0002, "m", False),
+    "steer_axis": Tolerance(0.0005, "m", False),
+    "steer_zero": Tolerance(0.002, "rad", False),
+    "torque_constant": Tolerance(0.01, "1", True),
+    "contact.mu_p": Tolerance(0.1, "1", True),
+    "contact.stiffness": Tolerance(0.15, "1", True),
+    "imu.position": Tolerance(0.005, "m", False),
+    "imu.gyro_bias": Tolerance(0.002, "rad/s", False),
+    "imu.accelerometer_bias": Tolerance(0.05, "m/s^2", False),
+    "imu.scale": Tolerance(0.005, "1", True),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotDescription:
+    """A robot on n >= 2 powered casters, validated when it is made."""
+
+    format: str = text("format of this file", choices=(FORMAT,))
+    name: str = text("name of the robot")
+    provenance: dict[str, str] = section("where each number comes from")
+    chassis: Chassis = section("everything that does not turn with a caster")
+    casters: tuple[Caster, ...] = section("the casters, in the order used by every array")
+    contact: ContactDescription = section("the nominal ground")
+    sensors: Sensors = section("what the robot measures")
+    tolerances: dict[str, Tolerance] = section("how far a healthy robot may differ", default_factory=dict)
+    physics: tuple[EffectInstance, ...] = section("effects beyond the nominal model; empty in a nominal robot", default=())
+
+    def __post_init__(self) -> None:
+        """Check what no single field can see.
+
+        Raises:
+            DescriptionError: fewer than two casters, a name twice, two casters on one axis, inertias that no body has.
+        """
+        _check_casters(self.casters)
+        _check_chassis(self.chassis)
+        for index, caster in enumerate(self.casters):
+            _check_module(caster, f"casters[{index}]")
+
+    @property
+    def n(self) -> int:
+        """Number of casters."""
+        return len(self.casters)
+
+    @cached_property
+    def caster_names(self) -> tuple[str, ...]:
+        """Names of the casters, in order."""
+        return tuple(caster.name for caster in self.casters)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the 2n joints, in the order of a flattened (n, 2) joint array."""
+        return tuple(f"{name}_{axis}" for name in self.caster_names for axis in AXIS_NAMES)
+
+    @cached_property
+    def steer_axis(self) -> FloatArray:
+        """Steering axes in base_link, (n, 2) [m]."""
+        return _constant([caster.steer_axis for caster in self.casters])
+
+    @cached_property
+    def caster_offset(self) -> FloatArray:
+        """Steering axis to wheel centre in the wheel frame, (n, 2) [m]."""
+        return _constant([caster.caster_offset for caster in self.casters])
+
+    @cached_property
+    def wheel_radius(self) -> FloatArray:
+        """Rolling radii, (n,) [m]."""
+        return _constant([caster.wheel_radius for caster in self.casters])
+
+    @cached_property
+    def gear_matrix(self) -> FloatArray:
+        """Motor angle from joint angle, (n, 2, 2), both in the order (drive, steer)."""
+        return _constant(
+            [
+                [[c.gears.drive, c.gears.drive_per_steer], [c.gears.steer_per_drive, c.gears.steer]]
+                for c in self.casters
+            ]
+        )
+
+    @cached_property
+    def armature(self) -> FloatArray:
+        """Rotor inertias seen at the joints, N^T diag(J) N, (n, 2, 2) [kg m^2]."""
+        matrices = []
+        for caster, gear in zip(self.casters, self.gear_matrix, strict=True):
+            matrices.append(gear.T @ np.diag([caster.rotors.drive, caster.rotors.steer]) @ gear)
+        return _constant(matrices)
+
+    @cached_property
+    def torque_limit(self) -> FloatArray:
+        """Largest joint torques, (n, 2) [N m]."""
+        return _constant([[c.limits.drive_torque, c.limits.steer_torque] for c in self.casters])
+
+    @cached_property
+    def speed_limit(self) -> FloatArray:
+        """Largest joint speeds, (n, 2) [rad/s]."""
+        return _constant([[c.limits.drive_speed, c.limits.steer_speed] for c in self.casters])
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the whole robot [kg]."""
+        return self.chassis.mass + sum(caster.module.mass for caster in self.casters)
+
+    def tolerance(self, name: str) -> Tolerance:
+        """Return the tolerance of this file, or the documented default."""
+        return self.tolerances.get(name, DEFAULT_TOLERANCES[name])
+
+    def caster_index(self, name: str) -> int:
+        """Return the index of a caster by name."""
+        try:
+            return self.caster_names.index(name)
+        except ValueError:
+            raise DescriptionError("caster", name, nearest_name(name, self.caster_names)) from None
+
+    def require_torque_control(self) -> None:
+        """Refuse robots whose steering cannot push the wheel sideways.
+
+        Raises:
+            KinematicsError: a caster has b_x of zero, so that B is singular and no steering torque makes a side force.
+        """
+        for caster in self.casters:
+            if abs(caster.caster_offset[0]) < MINIMUM_CASTER_OFFSET:
+                raise KinematicsError(
+                    f"{self.name}: caster {caster.name!r} has caster_offset[0] = {caster.caster_offset[0]:g} m; torque control "
+                    f"needs at least {MINIMUM_CASTER_OFFSET:g} m along the rolling direction, because the steering torque "
+                    "makes the side force through that lever arm (this robot loads for kinematics and analysis only)"
+                )
+
+
+def _constant(values: Any) -> FloatArray:
+    array = np.asarray(values, dtype=float)
+    array.setflags(write=False)
+    return array
+
+
+def _check_casters(casters: Sequence[Caster]) -> None:
+    if len(casters) < 2:
+        raise DescriptionError("casters", len(casters), "allowed: at least 2 casters (thesis section 3.1)")
+    names = [caster.name for caster in casters]
+    for index, caster in enumerate(casters):
+        where = f"casters[{index}]"
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", caster.name):
+            raise DescriptionError(f"{where}.name", caster.name, "allowed: letters, digits and _, beginning with a letter")
+        if names.index(caster.name) != index:
+            raise DescriptionError(f"{where}.name", caster.name, f"allowed: each name once; casters[{names.index(caster.name)}] has it")
+        for earlier in range(index):
+            distance = math.dist(caster.steer_axis, casters[earlier].steer_axis)
+            if distance < MINIMUM_AXIS_DISTANCE:
+                raise DescriptionError(
+                    f"{where}.steer_axis", list(caster.steer_axis),
+                    f"two casters on one axis: {casters[earlier].name!r} is {distance:g} m away; "
+                    f"allowed: at least {MINIMUM_AXIS_DISTANCE:g} m apart",
+                )
+        gears = caster.gears
+        determinant = gears.drive * gears.steer - gears.drive_per_steer * gears.steer_per_drive
+        if abs(determinant) < 1e-9:
+            raise DescriptionError(f"{where}.gears", determinant, "allowed: a gear matrix that can be inverted")
+
+
+def _check_chassis(chassis: Chassis) -> None:
+    xx, yy, zz = chassis.principal_inertias()
+    if zz > xx + yy or xx > yy + zz or yy > xx + zz:
+        raise DescriptionError(
+            "chassis.inertia_zz", zz,
+            f"non-physical inertia: no body has I_xx = {xx:g}, I_yy = {yy:g}, I_zz = {zz:g} kg m^2; "
+            "allowed: each at most the sum of the two others",
+        )
+    # A body of twice the stated size, all its mass at the corners, bounds what the number can be.
+    reach = math.hypot(chassis.size[0], chassis.size[1])
+    if zz > chassis.mass * reach**2:
+        raise DescriptionError(
+            "chassis.inertia_zz", zz, f"non-physical inertia for {chassis.mass:g} kg within {reach:g} m; "
+            f"allowed: at most {chassis.mass * reach**2:.3g} kg m^2",
+        )
+    if zz < 1e-3 * chassis.mass * reach**2:
+        raise DescriptionError(
+            "chassis.inertia_zz", zz, f"non-physical inertia for {chassis.mass:g} kg spread over {reach:g} m (a placeholder?); "
+            f"allowed: at least {1e-3 * chassis.mass * reach**2:.3g} kg m^2",
+        )
+
+
+def _check_module(caster: Caster, where: str) -> None:
+    wheel, radius = caster.wheel, caster.wheel_radius
+    if wheel.inertia_axle > wheel.mass * radius**2:
+        raise DescriptionError(
+            f"{where}.wheel.inertia_axle", wheel.inertia_axle,
+            f"non-physical inertia: a wheel of {wheel.mass:g} kg and {radius:g} m has at most m r^2 = "
+            f"{wheel.mass * radius**2:.4g} kg m^2 (a reflected rotor belongs under rotors)",
+        )
+    if wheel.mass > caster.module.mass:
+        raise DescriptionError(f"{where}.wheel.mass", wheel.mass, f"allowed: at most module.mass = {caster.module.mass:g} kg")
+
+
+_TOLERANCE = re.compile(r"^\s*([0-9.eE+-]+)\s*(.*?)\s*$")
+
+
+def read_tolerances(data: object, known: Mapping[str, Tolerance], key: str = "tolerances") -> dict[str, Tolerance]:
+    """Read a mapping of tolerances such as `{chassis.mass: 1 %, steer_zero: 0.002 rad}`.
+
+    Raises:
+        DescriptionError: unknown name, no number, or a unit other than % or the documented one.
+    """
+    if not isinstance(data, Mapping):
+        raise DescriptionError(key, data, "allowed: a mapping of names to tolerances")
+    tolerances = {}
+    for name, value in data.items():
+        where = f"{key}.{name}"
+        if name not in known:
+            raise DescriptionError(where, value, f"unknown key; {nearest_name(str(name), known)}")
+        unit = known[name].unit
+        allowed = f"allowed: a positive number with its unit, such as '1 %' or '{known[name]}' (unit {unit})"
+        match = _TOLERANCE.match(str(value))
+        try:
+            number = float(match.group(1)) if match else math.nan
+        except ValueError:
+            number = math.nan
+        found_unit = match.group(2) if match else ""
+        if not (math.isfinite(number) and number > 0.0) or found_unit not in ("%", unit):
+            raise DescriptionError(where, value, allowed)
+        relative = found_unit == "%"
+        tolerances[str(name)] = Tolerance(number / 100.0 if relative else number, unit, relative)
+    return tolerances
+
+
+def parse_robot(data: Mapping[str, Any]) -> RobotDescription:
+    """Read a robot description from a mapping, as it comes from YAML.
+
+    `caster_defaults` holds what all casters share; each entry of `casters` overrides it key by key.
+
+    Raises:
+        DescriptionError: names the key, the value and what is allowed.
+    """
+    content = dict(data)
+    found = content.get("format")
+    if found != FORMAT:
+        raise DescriptionError("format", found, f"allowed: {FORMAT}")
+    defaults = content.pop("caster_defaults", {}) or {}
+    if not isinstance(defaults, Mapping):
+        raise DescriptionError("caster_defaults", defaults, "allowed: a mapping, the same keys as a caster")
+    casters = content.get("casters")
+    if not isinstance(casters, list):
+        raise DescriptionError("casters", casters, "allowed: a list of casters")
+    content["casters"] = tuple(
+        read_section(Caster, _merged(defaults, item, f"casters[{index}]"), f"casters[{index}]")
+        for index, item in enumerate(casters)
+    )
+    provenance = content.get("provenance")
+    if not isinstance(provenance, Mapping) or not provenance:
+        raise DescriptionError("provenance", provenance, "allowed: a mapping that says where each number comes from")
+    content["provenance"] = {str(name): str(source) for name, source in provenance.items()}
+    content["tolerances"] = read_tolerances(content.get("tolerances") or {}, DEFAULT_TOLERANCES)
+    names = [caster.name for caster in content["casters"]]
+    content["physics"] = read_physics(content.get("physics") or [], names)
+    shape = (content.get("contact") or {}).get("shape") if isinstance(content.get("contact"), Mapping) else None
+    if shape is not None and not (
+        isinstance(shape, Mapping) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in shape.values())
+    ):
+        raise DescriptionError("contact.shape", shape, "allowed: a mapping of names to numbers")
+    robot: RobotDescription = read_section(RobotDescription, content, "")
+    return robot
+
+
+def _merged(defaults: Mapping[str, Any], own: object, where: str) -> dict[str, Any]:
+    if not isinstance(own, Mapping):
+        raise DescriptionError(where, own, "allowed: a mapping that describes one caster")
+    merged = dict(defaults)
+    for key, value in own.items():
+        base = defaults.get(key)
+        merged[key] = {**base, **value} if isinstance(base, Mapping) and isinstance(value, Mapping) else value
+    return merged
+
+
+def robots_directory() -> Path:
+    """Return the folder of the shipped robot descriptions, in an installation or in the source tree."""
+    module = Path(__file__).resolve()
+    source = module.parents[1] / "config" / "robots"
+    # An installed module is <prefix>/lib/pythonX.Y/site-packages/pcw_description/robot_description.py.
+    return source if source.is_dir() else module.parents[4] / "share" / "pcw_description" / "config" / "robots"
+
+
+def shipped_robots() -> tuple[str, ...]:
+    """Return the names of the shipped robot descriptions."""
+    return tuple(sorted(path.stem for path in robots_directory().glob("*.yaml")))
+
+
+def load_robot(robot: str | Path) -> RobotDescription:
+    """Load a robot description from a file, or a shipped one by its name.
+
+    Args:
+        robot: path of a YAML file, or a name such as "thesis" (see `shipped_robots`).
+
+    Raises:
+        DescriptionError: no such robot, or the file is not valid.
+    """
+    path = Path(robot)
+    if path.suffix not in (".yaml", ".yml"):
+        names = shipped_robots()
+        if str(robot) not in names:
+            raise DescriptionError("robot", str(robot), f"a path of a .yaml file, or a shipped robot; {nearest_name(str(robot), names)}")
+        path = robots_directory() / f"{robot}.yaml"
+    return parse_robot(load_yaml_mapping(path))
+
+
+def robot_to_mapping(robot: RobotDescription) -> dict[str, Any]:
+    """Return the mapping that `parse_robot` reads back to an equal robot."""
+    data: dict[str, Any] = {
+        "format": robot.format,
+        "name": robot.name,
+        "provenance": dict(robot.provenance),
+        "chassis": _plain(robot.chassis),
+        "casters": [_plain(caster) for caster in robot.casters],
+        "contact": _plain(robot.contact),
+        "sensors": _plain(robot.sensors),
+    }
+    if robot.tolerances:
+        data["tolerances"] = {name: str(tolerance) for name, tolerance in robot.tolerances.items()}
+    data["physics"] = [effect.to_mapping() for effect in robot.physics]
+    return data
+
+
+def save_robot(robot: RobotDescription, path: str | Path) -> None:
+    """Write a robot description that `load_robot` reads back."""
+    Path(path).write_text(yaml.safe_dump(robot_to_mapping(robot), sort_keys=False, allow_unicode=True), encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        items = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
+        return {name: _plain(item) for name, item in items if item is not None and item != {}}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value

@@ -1,0 +1,90 @@
+"""What every simulated robot offers, whatever computes it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+from pcw_description.errors import PcwError
+from pcw_description.robot_description import FloatArray, RobotDescription
+
+PLANT_NAMES = ("reduced", "pybullet")
+
+
+class PlantError(PcwError):
+    """A plant that cannot be made or has left what it can compute."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantState:
+    """The truth at one instant.
+
+    Attributes:
+        time: simulated time [s].
+        pose: pose of base_link in the world (x, y, yaw), yaw continuous [m, m, rad].
+        twist: twist of base_link in base_link (v_x, v_y, omega) [m/s, m/s, rad/s].
+        acceleration: acceleration of base_link's origin in base_link, and yaw acceleration (3,) [m/s^2, m/s^2, rad/s^2].
+        joint_position: (n, 2) [rad], continuous.
+        joint_velocity: (n, 2) [rad/s].
+        motor_torque: torques that the motors gave over the last step, joint side (n, 2) [N m].
+        slip: slip velocity at the contacts (n, 2) [m/s].
+        contact_force: force of the ground on the wheels in the wheel frames (n, 2) [N].
+        normal_force: (n,) [N].
+    """
+
+    time: float
+    pose: FloatArray
+    twist: FloatArray
+    acceleration: FloatArray
+    joint_position: FloatArray
+    joint_velocity: FloatArray
+    motor_torque: FloatArray
+    slip: FloatArray
+    contact_force: FloatArray
+    normal_force: FloatArray
+
+
+class Plant(Protocol):
+    """A robot on its wheels that takes joint torques."""
+
+    robot: RobotDescription
+    dt: float
+
+    def reset(self, pose: FloatArray | None = None, steer_angle: FloatArray | None = None) -> None:
+        """Put the robot at rest at a pose (3,), the wheels at headings (n,); time becomes zero."""
+
+    def step(self, motor_torque: FloatArray, steps: int = 1) -> None:
+        """Advance by `steps` steps of dt with joint-side motor torques (n, 2) [N m] held; limits are applied here."""
+
+    def state(self) -> PlantState:
+        """Return the truth now."""
+
+    def close(self) -> None:
+        """Free what the plant holds."""
+
+
+def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool = False) -> Plant:
+    """Make a plant of the robot.
+
+    Args:
+        name: "reduced" (planar, compiled) or "pybullet" (three-dimensional).
+        robot: the robot, with the effects of its `physics` at work.
+        dt: step [s].
+        gui: show a window (PyBullet only).
+
+    Raises:
+        PlantError: unknown name or a step that is not in 0.0001 to 0.005 s.
+        KinematicsError: the robot cannot be torque controlled.
+    """
+    if name not in PLANT_NAMES:
+        raise PlantError(f"plant {name!r} is not allowed; allowed: {', '.join(PLANT_NAMES)}")
+    if not 1e-4 <= dt <= 5e-3:
+        raise PlantError(f"dt = {dt!r} s is not allowed; allowed: 0.0001 to 0.005 s")
+    robot.require_torque_control()
+    if name == "reduced":
+        from .reduced import ReducedPlant
+
+        return ReducedPlant(robot, dt)
+    from .pybullet import PybulletPlant
+
+    return PybulletPlant(robot, dt, gui)
