@@ -181,17 +181,6 @@ class JointTorqueEffect(Effect):
 
 
 @dataclasses.dataclass(frozen=True)
-class ChassisWrenchEffect(Effect):
-    """A wrench that the effect adds to the chassis.
-
-    Attributes:
-        wrench: function (pose (3,), twist_base (3,), robot, parameters dict) -> wrench in base_link (3,) [N, N, N m].
-    """
-
-    wrench: Callable[..., FloatArray] = dataclasses.field(default=lambda *_: np.zeros(3), repr=False)
-
-
-@dataclasses.dataclass(frozen=True)
 class DescriptionEffect(Effect):
     """An effect that is a number of the description being another one than stated.
 
