@@ -289,10 +289,8 @@ pip_install() {
   "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --require-hashes "${@:2}" -r "$1"
 }
 
-# pybullet has no wheel for Python 3.12; without debug information and at -O2 it compiles in two thirds of the time.
 uv_install() {
-  CFLAGS="${CFLAGS:--g0 -O2}" "$venv/bin/uv" pip install --python "$venv/bin/python" --require-hashes --compile-bytecode \
-    "${@:2}" -r "$1"
+  "$venv/bin/uv" pip install --python "$venv/bin/python" --require-hashes --compile-bytecode "${@:2}" -r "$1"
 }
 
 # install_lock WHAT LOCK: with ROS, only those entries of the lock that neither the system nor the environment has.
@@ -315,7 +313,7 @@ install_lock() {
 warn_of_compiling() {
   [[ "$("$venv/bin/python" -I -S -c 'import sys; print(sys.version_info[1])')" -ge 12 ]] || return 0
   grep -q '^pybullet==' "$1" || return 0
-  say "pybullet has no wheel for this Python and is compiled from source: some minutes, the first time on this machine"
+  say "pybullet has no wheel for this Python and is compiled from source, once on this machine: 4-5 minutes on two cores"
   local include
   include="$("$venv/bin/python" -I -c 'import sysconfig; print(sysconfig.get_path("include"))')"
   if ! command -v c++ > /dev/null && ! command -v g++ > /dev/null || [[ ! -f "$include/Python.h" ]]; then
