@@ -27,6 +27,10 @@ class KinematicsError(PcwError):
     """A kinematic question that has no answer, such as the steering rate of a wheel without offset."""
 
 
+class RecordingError(PcwError):
+    """A recording that cannot be written or read; the message names the path and a remedy."""
+
+
 def nearest_name(name: str, known: Iterable[str]) -> str:
     """Return `"; did you mean 'x'?"` for the known name nearest to `name`, or the list of all of them."""
     names = sorted(known)

@@ -278,11 +278,7 @@ def ns_to_stamp(nanoseconds: int) -> Time:
 
 
 class StampWatch:
-    """Measures dt between the stamps of one stream and counts what is wrong with them.
-
-    `update(stamp)` returns dt [s] since the stamp before, or None for the first stamp, a repeated stamp, a
-    jump back, or a gap longer than `longest_gap` [s]; the next dt is then measured from this stamp.
-    """
+    """Measures dt between the stamps of one stream and counts what is wrong with them."""
 
     def __init__(self, longest_gap: float = 0.5) -> None:
         self.longest_gap = longest_gap
@@ -292,6 +288,11 @@ class StampWatch:
         self._last_ns: int | None = None
 
     def update(self, stamp: Time) -> float | None:
+        """Return dt [s] since the stamp before, or None where there is no dt to compute with.
+
+        None for the first stamp, a repeated stamp, a jump back, and a gap longer than `longest_gap` [s]; the
+        next dt is measured from this stamp.
+        """
         now_ns = stamp_to_ns(stamp)
         last_ns, self._last_ns = self._last_ns, now_ns
         if last_ns is None:
