@@ -1,9 +1,9 @@
 """pytest plugin of the test command: tests import the installed packages, never the source tree beside them.
 
 Tests of the source tree would pass where a module, a template or a configuration file is missing from the installation. And
-where one run collects several packages, pytest (--import-mode=importlib) takes a folder such as `pcw_control/`, which holds the
-package of that name but is not it, for a namespace package and puts it in the place of the real one, unless that is already
-imported. So all of them are imported here, before anything is collected.
+where one run collects several packages, pytest (--import-mode=importlib) takes a folder such as `pcw_control/`, which holds
+the package of that name but is not it, for a namespace package and puts it in the place of the real one, unless that is
+already imported. So all of them are imported here, before anything is collected.
 """
 
 from __future__ import annotations

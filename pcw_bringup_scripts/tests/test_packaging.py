@@ -1,0 +1,193 @@
+"""The six packages are what colcon, rosdep and `ros2 run` expect, and the installation holds all that the sources hold."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from catkin_pkg.package import parse_package
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PACKAGES = (
+    "pcw_description",
+    "pcw_estimation",
+    "pcw_control",
+    "pcw_terrain",
+    "pcw_sim_bridge",
+    "pcw_bringup_scripts",
+)
+MAY_STAND_AT_THE_TOP = {*PACKAGES, "README.md", "LICENSE"}
+
+# The rosdep key that brings a module, where it is not the module's own name (as it is for ROS packages).
+KEY_OF_MODULE = {
+    "can": "python3-can",
+    "jinja2": "python3-jinja2",
+    "matplotlib": "python3-matplotlib",
+    "mcap": "mcap-ros2-support",
+    "mcap_ros2": "mcap-ros2-support",
+    "numba": "python3-numba",
+    "numpy": "python3-numpy",
+    "pybullet": "python3-pybullet-pip",
+    "pytest": "python3-pytest",
+    "rosbags": "python3-rosbags-pip",
+    "scipy": "python3-scipy",
+    "yaml": "python3-yaml",
+}
+# Needed without being imported by the Python package itself.
+NOT_IMPORTED = {"launch", "launch_ros", "ros2launch"}
+
+
+def prefix_of(package: str) -> Path:
+    """The folder that the package is installed in."""
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if prefix and (Path(prefix) / "share/ament_index/resource_index/packages" / package).is_file():
+            return Path(prefix)
+    pytest.fail(f"{package} is in no prefix of AMENT_PREFIX_PATH: run ./pcw_bringup_scripts/test, or build and source it")
+
+
+def imports_of(package: str) -> set[str]:
+    """Top-level modules that the package imports, standard library and itself left out."""
+    modules = set()
+    for path in (REPOSITORY / package / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                modules.update(alias.name.partition(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                modules.add((node.module or "").partition(".")[0])
+    return modules - set(sys.stdlib_module_names) - {package}
+
+
+def tracked_files() -> list[str]:
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True)
+    if listing.returncode:
+        pytest.skip("not a git work tree")
+    return [name for name in listing.stdout.split("\0") if name and (REPOSITORY / name).is_file()]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_xml_is_valid(package):
+    """A maintainer e-mail that does not parse would silently turn the package into plain Python for colcon."""
+    warnings: list[str] = []
+    manifest = parse_package(str(REPOSITORY / package), warnings=warnings)
+    manifest.validate(warnings=warnings)
+    assert warnings == []
+    assert manifest.package_format == 3
+    assert manifest.name == package
+    assert manifest.get_build_type() == "ament_python"
+    assert manifest.licenses == ["Apache-2.0"]
+    assert [bool(re.fullmatch(r"[\w.+-]+@[\w-]+(\.[\w-]+)+", m.email)) for m in manifest.maintainers] == [True]
+    assert "python3-pytest" in {dependency.name for dependency in manifest.test_depends}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_versions_and_licence_agree(package):
+    manifest = parse_package(str(REPOSITORY / package))
+    metadata = importlib.metadata.metadata(package.replace("_", "-"))
+    assert metadata["Version"] == manifest.version
+    assert metadata["License"] == "Apache-2.0"
+    assert metadata.get_all("Provides-Extra") == ["test"], "without it `colcon test` runs nothing and calls that a success"
+    changelog = (REPOSITORY / package / "CHANGELOG.rst").read_text(encoding="utf-8")
+    newest, _ = re.findall(r"^(\d+\.\d+\.\d+) \((forthcoming|\d{4}-\d\d-\d\d)\)$", changelog, flags=re.MULTILINE)[0]
+    assert newest == manifest.version
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_and_declared_dependencies_agree(package):
+    declared = {dependency.name for dependency in parse_package(str(REPOSITORY / package)).exec_depends}
+    needed = {KEY_OF_MODULE.get(module, module) for module in imports_of(package)}
+    # The plugin that the test command loads is no part of what the package does.
+    needed -= {"python3-pytest"}
+    assert needed - declared == set(), "imported but not in package.xml"
+    assert declared - needed - NOT_IMPORTED == set(), "in package.xml but not imported"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_readme_says_why_each_dependency_is_there(package):
+    manifest = parse_package(str(REPOSITORY / package))
+    declared = {dependency.name for dependency in [*manifest.exec_depends, *manifest.test_depends]}
+    readme = (REPOSITORY / package / "README.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"^\| `([\w-]+)`(?: \(test\))? \| \S.*\|$", readme, flags=re.MULTILINE))
+    assert declared - explained == set()
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_executable_stands_where_ros2_run_looks(package):
+    declared = set(re.findall(r'"(\w+) = ([\w.]+:main)"', (REPOSITORY / package / "setup.py").read_text(encoding="utf-8")))
+    assert declared, "a package without executables"
+    installed = importlib.metadata.distribution(package.replace("_", "-")).entry_points
+    assert {(entry.name, entry.value) for entry in installed if entry.group == "console_scripts"} == declared
+    folder = prefix_of(package) / "lib" / package
+    assert {path.name for path in folder.iterdir()} >= {name for name, _ in declared}
+    for name, _ in declared:
+        assert os.access(folder / name, os.X_OK), name
+        assert (folder / name).read_text(encoding="utf-8").startswith("#!")
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "value"),
+    [
+        (package, *match)
+        for package in PACKAGES
+        for match in re.findall(r'"(\w+) = ([\w.]+:main)"', (REPOSITORY / package / "setup.py").read_text(encoding="utf-8"))
+    ],
+)
+def test_every_executable_has_its_function(package, name, value):
+    [entry] = importlib.metadata.entry_points(group="console_scripts", name=name, value=value)
+    assert callable(entry.load())
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_installation_holds_every_file_of_the_sources(package):
+    """A folder without `__init__.py`, or a template that package_data does not name, is missing from an installation."""
+    module = __import__(package)
+    source, installed = REPOSITORY / package / package, Path(str(module.__file__)).parent
+    assert installed != source, "the tests import the source tree instead of the installation"
+
+    def files(folder: Path) -> set[str]:
+        return {
+            path.relative_to(folder).as_posix()
+            for path in folder.rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        }
+
+    assert files(source) - files(installed) == set()
+    assert {name for name in files(installed) - files(source) if name.endswith(".py")} == set()
+    share = prefix_of(package) / "share" / package
+    for folder in ("config", "launch"):
+        if (REPOSITORY / package / folder).is_dir():
+            assert files(REPOSITORY / package / folder) - files(share / folder) == set()
+
+
+def test_only_the_packages_stand_at_the_top():
+    visible = {name.partition("/")[0] for name in tracked_files() if not name.startswith(".")}
+    assert visible - MAY_STAND_AT_THE_TOP == set()
+
+
+def test_no_file_names_a_path_of_one_machine():
+    machine_path = re.compile(r"(?<![\w.$}~-])/(?:home|root|Users)/\w")
+    offenders = []
+    for name in tracked_files():
+        content = (REPOSITORY / name).read_bytes()
+        if b"\0" not in content and machine_path.search(content.decode("utf-8", errors="replace")):
+            offenders.append(name)
+    assert offenders == []
+
+
+@pytest.mark.parametrize("name", ["bootstrap", "runtime", "test"])
+def test_every_requirement_is_pinned_and_hashed(name):
+    folder = REPOSITORY / "pcw_bringup_scripts/requirements"
+    lock = (folder / f"{name}.txt").read_text(encoding="utf-8")
+    entries = [line for line in lock.replace("\\\n", " ").splitlines() if line.strip() and not line.startswith("#")]
+    assert entries
+    for entry in entries:
+        assert re.match(r"[\w.-]+==\S+ .*--hash=sha256:[0-9a-f]{64}", entry), entry
+    assert "://" not in lock and "index-url" not in lock
+    wanted = re.findall(r"^([A-Za-z][\w.-]*)", (folder / f"{name}.in").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    pinned = {re.split("==", entry)[0] for entry in entries}
+    assert set(wanted) - pinned == set(), "run requirements/lock"
