@@ -85,6 +85,6 @@ def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool =
         from .reduced import ReducedPlant
 
         return ReducedPlant(robot, dt)
-    from .pybullet import PybulletPlant
+    from .pybullet_plant import PybulletPlant
 
     return PybulletPlant(robot, dt, gui)

@@ -19,20 +19,47 @@ import math
 
 import numpy as np
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import TYRE_SIZE, scrub_torque, tyre_parameters, tyre_step
+from pcw_description.contact.contact_model import scrub_torque, tyre_step
 from pcw_description.robot_description import FloatArray, RobotDescription
 
+from .caster_arrays import (
+    BX,
+    BY,
+    CX,
+    CY,
+    FX,
+    FY,
+    FZ,
+    I_ROLL,
+    IZZ,
+    J_PP,
+    J_RP,
+    LIMIT_DRIVE,
+    LIMIT_STEER,
+    MASS,
+    MOTOR_PHI,
+    MOTOR_RHO,
+    PHI,
+    PHI_DOT,
+    RADIUS,
+    RHO,
+    RHO_DOT,
+    SLIP_X,
+    SLIP_Y,
+    SX,
+    SY,
+    TYRE,
+    WHEEL_STATE,
+    ZX,
+    ZY,
+    caster_numbers,
+)
 from .joint_effects import JointEffects, joint_effect_torque
 from .nominal_changes import as_it_really_is
 from .plant import PlantError, PlantState
 
 GRAVITY = 9.81
 
-# Columns of the constant numbers of a caster.
-_SX, _SY, _BX, _BY, _RADIUS, _MASS, _CX, _CY, _IZZ, _I_ROLL, _J_RP, _J_PP, _LIMIT_DRIVE, _LIMIT_STEER, _TYRE = range(15)
-# Columns of the state of a caster.
-_RHO, _PHI, _RHO_DOT, _PHI_DOT, _ZX, _ZY, _MOTOR_RHO, _MOTOR_PHI, _SLIP_X, _SLIP_Y, _FX, _FY, _FZ = range(13)
-_WHEEL_STATE = 13
 # Entries of the chassis numbers and of the body state.
 _M, _COM_X, _COM_Y, _I, _COM_Z = range(5)
 _X, _Y, _YAW, _VX, _VY, _OMEGA, _AX, _AY, _ALPHA = range(9)
@@ -73,8 +100,14 @@ def support_forces(mass, com_x, com_y, com_z, acc_x, acc_y, centre, normal_force
 
 @compiled
 def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_numbers, command, body, wheels):  # type: ignore[no-untyped-def]
-    """Advance body (9,) and wheels (n, 13) in place by `steps` steps with the motor torques command (n, 2) held."""
+    """Advance body (9,) and wheels (n, 13) in place by `steps` steps with the motor torques command (n, 2) held.
+
+    Returns False, and changes nothing, if a torque is not finite.
+    """
     n = len(casters)
+    for i in range(n):
+        if not (math.isfinite(command[i, 0]) and math.isfinite(command[i, 1])):
+            return False
     centre = np.empty((n, 2))
     normal = np.empty(n)
     coupling = np.empty((n, 3))
@@ -83,7 +116,7 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
     steer_rhs = np.empty(n)
     total_mass = chassis[_M]
     for i in range(n):
-        total_mass += casters[i, _MASS]
+        total_mass += casters[i, MASS]
     for _ in range(steps):
         vx, vy, omega = body[_VX], body[_VY], body[_OMEGA]
         mass, cx, cy = chassis[_M], chassis[_COM_X], chassis[_COM_Y]
@@ -94,41 +127,41 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
         f2 = -mass * omega * (cx * vx + cy * vy)
         com_x, com_y, com_z = mass * cx, mass * cy, mass * chassis[_COM_Z]
         for i in range(n):
-            c, s = math.cos(wheels[i, _PHI]), math.sin(wheels[i, _PHI])
-            centre[i, 0] = casters[i, _SX] + casters[i, _BX] * c - casters[i, _BY] * s
-            centre[i, 1] = casters[i, _SY] + casters[i, _BX] * s + casters[i, _BY] * c
-            com_x += casters[i, _MASS] * (casters[i, _SX] + casters[i, _CX] * c - casters[i, _CY] * s)
-            com_y += casters[i, _MASS] * (casters[i, _SY] + casters[i, _CX] * s + casters[i, _CY] * c)
-            com_z += casters[i, _MASS] * casters[i, _RADIUS]
+            c, s = math.cos(wheels[i, PHI]), math.sin(wheels[i, PHI])
+            centre[i, 0] = casters[i, SX] + casters[i, BX] * c - casters[i, BY] * s
+            centre[i, 1] = casters[i, SY] + casters[i, BX] * s + casters[i, BY] * c
+            com_x += casters[i, MASS] * (casters[i, SX] + casters[i, CX] * c - casters[i, CY] * s)
+            com_y += casters[i, MASS] * (casters[i, SY] + casters[i, CX] * s + casters[i, CY] * c)
+            com_z += casters[i, MASS] * casters[i, RADIUS]
         support_forces(
             total_mass, com_x / total_mass, com_y / total_mass, com_z / total_mass, body[_AX], body[_AY], centre, normal
         )
         for i in range(n):
-            c, s = math.cos(wheels[i, _PHI]), math.sin(wheels[i, _PHI])
-            rho_dot, phi_dot = wheels[i, _RHO_DOT], wheels[i, _PHI_DOT]
+            c, s = math.cos(wheels[i, PHI]), math.sin(wheels[i, PHI])
+            rho_dot, phi_dot = wheels[i, RHO_DOT], wheels[i, PHI_DOT]
             sigma = phi_dot + omega
-            sx, sy, bx, by = casters[i, _SX], casters[i, _SY], casters[i, _BX], casters[i, _BY]
-            radius = casters[i, _RADIUS]
+            sx, sy, bx, by = casters[i, SX], casters[i, SY], casters[i, BX], casters[i, BY]
+            radius = casters[i, RADIUS]
             # Velocity of the wheel centre in the wheel frame.
             axis_x, axis_y = vx - omega * sy, vy + omega * sx
             along = c * axis_x + s * axis_y - sigma * by
             across = -s * axis_x + c * axis_y + sigma * bx
             slip_x, slip_y = radius * rho_dot - along, -across
             speed = max(abs(radius * rho_dot), math.sqrt(along * along + across * across))
-            tyre = casters[i, _TYRE:]
-            zx, zy, fx, fy = tyre_step(tyre, wheels[i, _ZX], wheels[i, _ZY], slip_x, slip_y, speed, normal[i], dt)
+            tyre = casters[i, TYRE:]
+            zx, zy, fx, fy = tyre_step(tyre, wheels[i, ZX], wheels[i, ZY], slip_x, slip_y, speed, normal[i], dt)
             spin = scrub_torque(tyre, sigma, speed, normal[i])
-            wheels[i, _ZX], wheels[i, _ZY] = zx, zy
-            wheels[i, _SLIP_X], wheels[i, _SLIP_Y] = slip_x, slip_y
-            wheels[i, _FX], wheels[i, _FY], wheels[i, _FZ] = fx, fy, normal[i]
+            wheels[i, ZX], wheels[i, ZY] = zx, zy
+            wheels[i, SLIP_X], wheels[i, SLIP_Y] = slip_x, slip_y
+            wheels[i, FX], wheels[i, FY], wheels[i, FZ] = fx, fy, normal[i]
             force_x, force_y = c * fx - s * fy, s * fx + c * fy
             f0 += force_x
             f1 += force_y
             f2 += centre[i, 0] * force_y - centre[i, 1] * force_x + spin
             # The module as a body at q = S + c, turning at sigma.
-            m, izz = casters[i, _MASS], casters[i, _IZZ]
-            lever_x = casters[i, _CX] * c - casters[i, _CY] * s
-            lever_y = casters[i, _CX] * s + casters[i, _CY] * c
+            m, izz = casters[i, MASS], casters[i, IZZ]
+            lever_x = casters[i, CX] * c - casters[i, CY] * s
+            lever_y = casters[i, CX] * s + casters[i, CY] * c
             qx, qy = sx + lever_x, sy + lever_y
             m00 += m
             m11 += m
@@ -142,11 +175,11 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
             f2 -= m * (qx * bias_y - qy * bias_x)
             coupling[i, 0], coupling[i, 1] = -m * lever_y, m * lever_x
             coupling[i, 2] = izz + m * (qx * lever_x + qy * lever_y)
-            inertia_pp = izz + m * (lever_x * lever_x + lever_y * lever_y) + casters[i, _J_PP]
-            inertia_rr, inertia_rp = casters[i, _I_ROLL], casters[i, _J_RP]
-            motor_rho = min(max(command[i, 0], -casters[i, _LIMIT_DRIVE]), casters[i, _LIMIT_DRIVE])
-            motor_phi = min(max(command[i, 1], -casters[i, _LIMIT_STEER]), casters[i, _LIMIT_STEER])
-            wheels[i, _MOTOR_RHO], wheels[i, _MOTOR_PHI] = motor_rho, motor_phi
+            inertia_pp = izz + m * (lever_x * lever_x + lever_y * lever_y) + casters[i, J_PP]
+            inertia_rr, inertia_rp = casters[i, I_ROLL], casters[i, J_RP]
+            motor_rho = min(max(command[i, 0], -casters[i, LIMIT_DRIVE]), casters[i, LIMIT_DRIVE])
+            motor_phi = min(max(command[i, 1], -casters[i, LIMIT_STEER]), casters[i, LIMIT_STEER])
+            wheels[i, MOTOR_RHO], wheels[i, MOTOR_PHI] = motor_rho, motor_phi
             rhs_r = motor_rho - radius * fx
             rhs_p = motor_phi + bx * fy - by * fx + spin - m * (lever_x * bias_y - lever_y * bias_x)
             for k in range(len(effect_place)):
@@ -154,13 +187,13 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
                     numbers = effect_numbers[k]
                     if effect_place[k, 1] == 0:
                         torque, slope = joint_effect_torque(
-                            effect_kernels[k], wheels[i, _RHO], rho_dot, motor_rho, normal[i], numbers
+                            effect_kernels[k], wheels[i, RHO], rho_dot, motor_rho, normal[i], numbers
                         )
                         rhs_r += torque
                         inertia_rr += dt * slope
                     else:
                         torque, slope = joint_effect_torque(
-                            effect_kernels[k], wheels[i, _PHI], phi_dot, motor_phi, normal[i], numbers
+                            effect_kernels[k], wheels[i, PHI], phi_dot, motor_phi, normal[i], numbers
                         )
                         rhs_p += torque
                         inertia_pp += dt * slope
@@ -196,10 +229,11 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
         body[_YAW] += dt * body[_OMEGA]
         for i in range(n):
             rhs_p = steer_rhs[i] - (coupling[i, 0] * d0 + coupling[i, 1] * d1 + coupling[i, 2] * d2)
-            wheels[i, _RHO_DOT] += dt * (inverse[i, 0] * drive_rhs[i] + inverse[i, 1] * rhs_p)
-            wheels[i, _PHI_DOT] += dt * (inverse[i, 1] * drive_rhs[i] + inverse[i, 2] * rhs_p)
-            wheels[i, _RHO] += dt * wheels[i, _RHO_DOT]
-            wheels[i, _PHI] += dt * wheels[i, _PHI_DOT]
+            wheels[i, RHO_DOT] += dt * (inverse[i, 0] * drive_rhs[i] + inverse[i, 1] * rhs_p)
+            wheels[i, PHI_DOT] += dt * (inverse[i, 1] * drive_rhs[i] + inverse[i, 2] * rhs_p)
+            wheels[i, RHO] += dt * wheels[i, RHO_DOT]
+            wheels[i, PHI] += dt * wheels[i, PHI_DOT]
+    return True
 
 
 class ReducedPlant:
@@ -217,10 +251,10 @@ class ReducedPlant:
         true_robot = as_it_really_is(robot)
         chassis = true_robot.chassis
         self._chassis = np.array([chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2]])
-        self._casters = _caster_numbers(true_robot)
+        self._casters = caster_numbers(true_robot)
         self._effects = JointEffects(robot)
         self._body = np.zeros(9)
-        self._wheels = np.zeros((robot.n, _WHEEL_STATE))
+        self._wheels = np.zeros((robot.n, WHEEL_STATE))
         self._time = 0.0
         self.reset()
 
@@ -232,7 +266,7 @@ class ReducedPlant:
         if pose is not None:
             self._body[[_X, _Y, _YAW]] = pose
         if steer_angle is not None:
-            self._wheels[:, _PHI] = steer_angle
+            self._wheels[:, PHI] = steer_angle
 
     def step(self, motor_torque: FloatArray, steps: int = 1) -> None:
         """Advance by `steps` steps of dt with motor torques (n, 2) [N m] held.
@@ -240,12 +274,11 @@ class ReducedPlant:
         Raises:
             PlantError: a torque is NaN or infinite; the plant has not moved.
         """
-        if not np.isfinite(motor_torque).all():
-            raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
-        _advance(
+        if not _advance(
             steps, self.dt, self._chassis, self._casters, self._effects.kernels, self._effects.place, self._effects.numbers,
             motor_torque, self._body, self._wheels,
-        )
+        ):
+            raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
         self._time += steps * self.dt
 
     def state(self) -> PlantState:
@@ -256,29 +289,13 @@ class ReducedPlant:
             pose=body[_X : _YAW + 1].copy(),
             twist=body[_VX : _OMEGA + 1].copy(),
             acceleration=body[_AX : _ALPHA + 1].copy(),
-            joint_position=wheels[:, _RHO : _PHI + 1].copy(),
-            joint_velocity=wheels[:, _RHO_DOT : _PHI_DOT + 1].copy(),
-            motor_torque=wheels[:, _MOTOR_RHO : _MOTOR_PHI + 1].copy(),
-            slip=wheels[:, _SLIP_X : _SLIP_Y + 1].copy(),
-            contact_force=wheels[:, _FX : _FY + 1].copy(),
-            normal_force=wheels[:, _FZ].copy(),
+            joint_position=wheels[:, RHO : PHI + 1].copy(),
+            joint_velocity=wheels[:, RHO_DOT : PHI_DOT + 1].copy(),
+            motor_torque=wheels[:, MOTOR_RHO : MOTOR_PHI + 1].copy(),
+            slip=wheels[:, SLIP_X : SLIP_Y + 1].copy(),
+            contact_force=wheels[:, FX : FY + 1].copy(),
+            normal_force=wheels[:, FZ].copy(),
         )
 
     def close(self) -> None:
         """Free what the plant holds: nothing."""
-
-
-def _caster_numbers(robot: RobotDescription) -> FloatArray:
-    """Return the constant numbers of all casters, (n, _TYRE + TYRE_SIZE)."""
-    numbers = np.empty((robot.n, _TYRE + TYRE_SIZE))
-    for row, caster, armature in zip(numbers, robot.casters, robot.armature, strict=True):
-        row[[_SX, _SY]] = caster.steer_axis
-        row[[_BX, _BY]] = caster.caster_offset
-        row[[_RADIUS, _MASS]] = caster.wheel_radius, caster.module.mass
-        row[[_CX, _CY]] = caster.module.com
-        row[_IZZ] = caster.module.inertia_zz
-        row[_I_ROLL] = caster.wheel.inertia_axle + armature[0, 0]
-        row[[_J_RP, _J_PP]] = armature[0, 1], armature[1, 1]
-        row[[_LIMIT_DRIVE, _LIMIT_STEER]] = caster.limits.drive_torque, caster.limits.steer_torque
-        row[_TYRE:] = tyre_parameters(robot.contact)
-    return numbers
