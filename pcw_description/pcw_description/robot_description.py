@@ -422,8 +422,37 @@ def _check_module(caster: Caster, where: str) -> None:
             f"non-physical inertia: a wheel of {wheel.mass:g} kg and {radius:g} m has at most m r^2 = "
             f"{wheel.mass * radius**2:.4g} kg m^2 (a reflected rotor belongs under rotors)",
         )
-    if wheel.mass > caster.module.mass:
-        raise DescriptionError(f"{where}.wheel.mass", wheel.mass, f"allowed: at most module.mass = {caster.module.mass:g} kg")
+    module = caster.module
+    if wheel.mass >= module.mass:
+        raise DescriptionError(
+            f"{where}.wheel.mass", wheel.mass, f"allowed: below module.mass = {module.mass:g} kg, which is fork and wheel together"
+        )
+    least = thinnest_module_inertia(caster)
+    if module.inertia_zz <= least:
+        raise DescriptionError(
+            f"{where}.module.inertia_zz", module.inertia_zz,
+            f"non-physical inertia (a placeholder?): its wheel and the distance to it alone make {least:.4g} kg m^2; "
+            "allowed: above that",
+        )
+    reach = math.hypot(*caster.caster_offset) + math.hypot(*module.com) + 4.0 * radius
+    if module.inertia_zz > module.mass * reach**2:
+        raise DescriptionError(
+            f"{where}.module.inertia_zz", module.inertia_zz,
+            f"non-physical inertia for {module.mass:g} kg within {reach:.3g} m of the steering axis; "
+            f"allowed: at most {module.mass * reach**2:.3g} kg m^2",
+        )
+
+
+def thinnest_module_inertia(caster: Caster) -> float:
+    """Return the least I_zz that a module with this wheel can have [kg m^2], about its centre of mass.
+
+    A flat wheel has I_axle / 2 about a diameter, and the fork, however compact, is as far from the wheel as the two
+    centres of mass say (parallel axes).
+    """
+    wheel, module = caster.wheel, caster.module
+    fork_mass = module.mass - wheel.mass
+    from_com = math.dist(module.com, caster.caster_offset)
+    return wheel.inertia_axle / 2.0 + wheel.mass * from_com**2 * (1.0 + wheel.mass / fork_mass)
 
 
 _TOLERANCE = re.compile(r"^\s*([0-9.eE+-]+)\s*(.*?)\s*$")
