@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.optimize
 
-from .differential_kinematics import joint_matrix_blocks, wheel_centres, wheel_jacobian
+from .differential_kinematics import wheel_centres, wheel_jacobian
 from .errors import KinematicsError
 from .robot_description import FloatArray, RobotDescription
 
@@ -100,12 +100,17 @@ def _actuated_rows(robot: RobotDescription, steer_angle: FloatArray, actuated: n
     if actuated.shape != (robot.n, 2):
         raise KinematicsError(f"actuated has the shape {actuated.shape}; allowed: ({robot.n}, 2), drive and steer per caster")
     rows = wheel_jacobian(robot, steer_angle).reshape(robot.n, 2, 3).copy()
-    blocks = joint_matrix_blocks(robot)
-    for i in range(robot.n):
-        # Locking only the drive of a wheel with lateral offset mixes the rows: rho_dot = (u.v - b_y phi_dot) / r.
-        if blocks[i, 1, 1] != 0.0:
-            rows[i, 0] -= blocks[i, 0, 1] / blocks[i, 1, 1] * rows[i, 1]
+    held = actuated.copy()
+    for i, (b_x, b_y) in enumerate(robot.caster_offset):
+        if b_x != 0.0:
+            # Locking only the drive of a wheel with lateral offset mixes the rows: rho_dot = (u.v - b_y phi_dot) / r.
+            rows[i, 0] += b_y / b_x * rows[i, 1]
+        else:
+            # Without b_x no joint moves the wheel across its heading, locked or not; and beside its axis (b_y) a wheel with
+            # a locked drive still follows the robot by steering.
+            held[i, 1] = True
+            held[i, 0] = actuated[i, 0] and (actuated[i, 1] or b_y == 0.0)
     size = float(np.max(np.linalg.norm(robot.steer_axis - robot.steer_axis.mean(axis=0), axis=1)))
     rows[:, :, 2] /= size
-    selected: FloatArray = rows[actuated]
+    selected: FloatArray = rows[held]
     return selected
