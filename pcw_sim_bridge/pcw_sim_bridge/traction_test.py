@@ -53,7 +53,7 @@ def measure_traction(
 ) -> TractionCurve:
     """Drive a `traction_rig` straight at `speed` and bring its first wheel to each slip ratio in turn.
 
-    The wheel under test is speed controlled to speed / (1 - lambda); the others keep the robot's speed, all headings are
+    The wheel under test is speed controlled to the true speed / (1 - lambda); the others keep the robot's speed, all headings are
     held at zero.
 
     Args:
@@ -90,7 +90,7 @@ def measure_traction(
         error = wanted_speed - state.twist[0]
         body_integral += error * plant.dt
         torque[:, DRIVE] = body_gain * (error + 5.0 * body_integral)
-        wheel_error = wanted_speed / (1.0 - target_slip) / radius[caster] - state.joint_velocity[caster, DRIVE]
+        wheel_error = state.twist[0] / (1.0 - target_slip) / radius[caster] - state.joint_velocity[caster, DRIVE]
         integral += wheel_error * plant.dt
         torque[caster, DRIVE] = wheel_gain * (wheel_error + 400.0 * integral)
         torque[:, STEER] = -steer_inertia * (900.0 * state.joint_position[:, STEER] + 60.0 * state.joint_velocity[:, STEER])
