@@ -142,6 +142,19 @@ def test_every_executable_has_its_function(package, name, value):
     assert callable(entry.load())
 
 
+@pytest.mark.parametrize("readme", ["README.md", *(f"{package}/README.md" for package in PACKAGES)])
+def test_what_a_readme_names_is_there(readme):
+    """Every `ros2 run PACKAGE EXECUTABLE`, every `./pcw_bringup_scripts/...` command and every linked file."""
+    text = (REPOSITORY / readme).read_text(encoding="utf-8")
+    for package, executable in re.findall(r"(?:ros2 run|pcw_bringup_scripts/run) +(pcw_\w+) +([a-z]\w*)", text):
+        declared = (REPOSITORY / package / "setup.py").read_text(encoding="utf-8")
+        assert f'"{executable} = {package}.' in declared, f"{package} has no executable {executable}"
+    for path in re.findall(r"\./(pcw_bringup_scripts/[\w./]+)", text):
+        assert (REPOSITORY / path).is_file(), path
+    for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text):
+        assert ((REPOSITORY / readme).parent / target).exists(), target
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_installation_holds_every_file_of_the_sources(package):
     """A folder without `__init__.py`, or a template that package_data does not name, is missing from an installation."""
