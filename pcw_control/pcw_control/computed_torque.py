@@ -1,0 +1,267 @@
+"""Computed torque with the least internal force: the IFM scheme of table 5.2 [Li2009].
+
+    F = Lambda (V_dot_d + k_p e + k_d e_dot) + theta          table 5.2
+    F_con = (A^T)^+ F = A (A^T A)^-1 F                        (5.6), the solution of F = A^T F_con (5.2)
+    tau = B^T F_con                                           joint side
+
+in base_link. The pseudo-inverse leaves no internal force (5.3): E F_con = 0. With a lateral offset b_y, B^T is not B: the
+steering feels the driving force through that lever arm, and B^T is what conserves power, tau . q_dot = F_con . B q_dot.
+
+The velocity fed back is the odometric one, V = A^+ B q_dot. The true velocity of the body would close the loop through the
+tyre compliance between motor and body, which makes the steering oscillate at some 10 Hz.
+
+Two kinds of reference:
+
+* a twist to follow. The reference twist moves towards it within limits of acceleration; e_dot is the velocity error in
+  base_link and e its integral, which takes up friction and slope. Where the robot is plays no part.
+* a point of a trajectory in odom. e and e_dot are errors of pose and velocity in odom, turned into base_link. V_dot is the
+  derivative of components in a turning frame, hence the - omega x V; the error then obeys e_ddot + k_d e_dot + k_p e = 0.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from pcw_description.augmented_object_model import AugmentedObjectModel
+from pcw_description.differential_kinematics import (
+    forward_kinematics_kernel,
+    joint_matrix_blocks,
+    wheel_jacobian_kernel,
+)
+from pcw_description.robot_description import STEER, FloatArray, RobotDescription
+
+from .errors import ControlError
+from .quintic_trajectory import MotionLimits, TrajectoryPoint
+
+
+@dataclasses.dataclass(frozen=True)
+class ComputedTorqueParameters:
+    """Gains and limits.
+
+    The gains are those of a unit mass: Lambda scales them to the robot. The defaults place both poles of the pose error at
+    10 rad/s, five times below what a loop delay of 2 ms would disturb.
+
+    Attributes:
+        velocity_gain: k_d [1/s].
+        position_gain: k_p on the pose error [1/s^2].
+        integral_gain: k_p on the integral of the velocity error, when a twist is followed [1/s^2].
+        integral_limit: largest acceleration that this integral may ask for (x, y [m/s^2], yaw [rad/s^2]).
+        limits: limits of the reference when a twist is followed.
+        joint_speed_fraction: the reference twist is slowed down where a joint would turn faster than this part of its
+            limit. A caster that turns round is the usual cause: it steers at up to v/b.
+    """
+
+    velocity_gain: float = 20.0
+    position_gain: float = 100.0
+    integral_gain: float = 50.0
+    integral_limit: tuple[float, float, float] = (1.0, 1.0, 3.0)
+    limits: MotionLimits = dataclasses.field(default_factory=lambda: MotionLimits(1.5, 0.5, 3.0, 1.5))
+    joint_speed_fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        """Check the parameters.
+
+        Raises:
+            ControlError: names the field, its value and what is allowed.
+        """
+        for name in ("velocity_gain", "position_gain", "integral_gain"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ControlError(f"{name} = {value!r} is not allowed; allowed: a finite number, at least 0")
+        if len(self.integral_limit) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in self.integral_limit):
+            raise ControlError(f"integral_limit = {self.integral_limit!r} is not allowed; allowed: three numbers, at least 0")
+        if not 0.0 < self.joint_speed_fraction <= 1.0:
+            raise ControlError(
+                f"joint_speed_fraction = {self.joint_speed_fraction!r} is not allowed; allowed: above 0, at most 1"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class ComputedTorqueState:
+    """What the controller remembers.
+
+    Attributes:
+        reference_twist: rate-limited twist followed now, in base_link (3,).
+        error_integral: integral of the velocity error in base_link (3,) [m, m, rad].
+    """
+
+    reference_twist: FloatArray
+    error_integral: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class ComputedTorqueMeasurement:
+    """What the controller measures.
+
+    Attributes:
+        joint_position: (n, 2) [rad].
+        joint_velocity: (n, 2) [rad/s].
+        pose: pose of base_link in odom, from odometry (3,) [m, m, rad]; unused when a twist is followed.
+        saturated: the torque before this one had to be limited, so the integral holds.
+    """
+
+    joint_position: FloatArray
+    joint_velocity: FloatArray
+    pose: FloatArray
+    saturated: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class TwistReference:
+    """A twist of base_link in base_link to follow (3,) [m/s, m/s, rad/s]."""
+
+    twist: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class ComputedTorqueOutput:
+    """What one step gives; the torque still has to pass the torque limits.
+
+    Attributes:
+        torque: joint torques (n, 2) [N m].
+        contact_force: wanted contact forces in the wheel frames (n, 2) [N].
+        wrench: operational force F (3,) [N, N, N m] in base_link.
+        twist: odometric twist (3,) in base_link.
+        reference_twist: twist wanted now (3,) in base_link.
+    """
+
+    torque: FloatArray
+    contact_force: FloatArray
+    wrench: FloatArray
+    twist: FloatArray
+    reference_twist: FloatArray
+
+
+def initial_state(twist: FloatArray | None = None) -> ComputedTorqueState:
+    """Return the state of a controller that takes over at a twist (3,), or at rest."""
+    return ComputedTorqueState(np.zeros(3) if twist is None else np.array(twist, dtype=float), np.zeros(3))
+
+
+class ComputedTorque:
+    """The controller of one robot: numbers gathered once, and a pure step.
+
+    Args:
+        robot: the robot; its `physics` are not known to a controller and are left out.
+        parameters: gains and limits.
+
+    Raises:
+        KinematicsError: a caster without offset, whose steering torque makes no side force.
+    """
+
+    def __init__(self, robot: RobotDescription, parameters: ComputedTorqueParameters | None = None) -> None:
+        self.parameters = parameters or ComputedTorqueParameters()
+        self._n = robot.n
+        self._model = AugmentedObjectModel(robot)
+        self._geometry = (robot.steer_axis, robot.caster_offset)
+        self._radius = robot.wheel_radius
+        self._B = joint_matrix_blocks(robot)
+        self._B_inverse = np.linalg.inv(self._B)
+        self._speed_limit = robot.speed_limit * self.parameters.joint_speed_fraction
+
+    def step(
+        self,
+        state: ComputedTorqueState,
+        measurement: ComputedTorqueMeasurement,
+        reference: TwistReference | TrajectoryPoint,
+        dt: float,
+    ) -> tuple[ComputedTorqueState, ComputedTorqueOutput]:
+        """Compute the torques of one cycle.
+
+        Args:
+            state: state after the cycle before.
+            measurement: joints and pose now.
+            reference: a twist, or a point of a trajectory in odom.
+            dt: measured time since the cycle before [s].
+
+        Returns:
+            New state and output.
+
+        Raises:
+            ControlError: dt is not positive, or a measurement or the reference is not finite; the state stays as it was.
+        """
+        self._check(measurement, reference, dt)
+        steer_angle = np.ascontiguousarray(measurement.joint_position[:, STEER])
+        A = wheel_jacobian_kernel(*self._geometry, steer_angle)
+        V, _, normal_inverse = forward_kinematics_kernel(
+            *self._geometry, self._radius, steer_angle, np.ascontiguousarray(measurement.joint_velocity)
+        )
+        if isinstance(reference, TwistReference):
+            state, V_dot = self._towards_twist(state, reference.twist, V, A, measurement.saturated, dt)
+        else:
+            state, V_dot = self._towards_point(reference, measurement.pose, V)
+        inertia, bias = self._model.evaluate(steer_angle, V)
+        F = inertia @ V_dot + bias
+        F_con = (A @ (normal_inverse @ F)).reshape(self._n, 2)
+        tau = np.einsum("nji,nj->ni", self._B, F_con)
+        return state, ComputedTorqueOutput(tau, F_con, F, V, state.reference_twist)
+
+    def _towards_twist(
+        self, state: ComputedTorqueState, target: FloatArray, V: FloatArray, A: FloatArray, saturated: bool, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        p = self.parameters
+        limits = p.limits
+        wanted = target * _shrink(target, limits.speed, limits.yaw_rate)
+        wanted = wanted * self._joint_speed_factor(A, wanted)
+        change = wanted - state.reference_twist
+        change = change * _shrink(change, limits.acceleration * dt, limits.yaw_acceleration * dt)
+        V_d = state.reference_twist + change
+        # A caster may turn round in less time than the deceleration allows; then the limit of the joint comes first.
+        V_d = V_d * self._joint_speed_factor(A, V_d, slack=1.0 / p.joint_speed_fraction)
+        change = V_d - state.reference_twist
+        V_dot_d = change / dt * _shrink(change, limits.acceleration * dt, limits.yaw_acceleration * dt)
+        e_dot = V_d - V
+        e = state.error_integral
+        if not saturated and p.integral_gain > 0.0:
+            largest = np.array(p.integral_limit) / p.integral_gain
+            e = np.clip(e + e_dot * dt, -largest, largest)
+        return ComputedTorqueState(V_d, e), V_dot_d + p.integral_gain * e + p.velocity_gain * e_dot
+
+    def _towards_point(
+        self, point: TrajectoryPoint, pose: FloatArray, V: FloatArray
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        p = self.parameters
+        R_T = _rotation(-pose[2])
+        e = point.pose - pose
+        e[2] = math.remainder(e[2], math.tau)
+        V_d = R_T @ point.velocity
+        omega_cross_V = np.array([-V[2] * V[1], V[2] * V[0], 0.0])
+        V_dot = R_T @ (point.acceleration + p.position_gain * e) + p.velocity_gain * (V_d - V) - omega_cross_V
+        # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
+        return ComputedTorqueState(V_d, np.zeros(3)), V_dot
+
+    def _joint_speed_factor(self, A: FloatArray, twist: FloatArray, slack: float = 1.0) -> float:
+        """Return the factor up to 1 that keeps B^-1 A V within the joints' speed limits."""
+        joint_velocity = np.einsum("nij,nj->ni", self._B_inverse, (A @ twist).reshape(self._n, 2))
+        return 1.0 / max(1.0, float(np.max(np.abs(joint_velocity) / (self._speed_limit * slack))))
+
+    def _check(
+        self, measurement: ComputedTorqueMeasurement, reference: TwistReference | TrajectoryPoint, dt: float
+    ) -> None:
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ControlError(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
+        for name, values in (("joint_position", measurement.joint_position), ("joint_velocity", measurement.joint_velocity)):
+            if values.shape != (self._n, 2) or not np.isfinite(values).all():
+                raise ControlError(f"{name} = {values.tolist()} is not allowed; allowed: finite numbers, shape ({self._n}, 2)")
+        if isinstance(reference, TwistReference):
+            needed = {"reference twist": reference.twist}
+        else:
+            needed = {
+                "pose": measurement.pose, "reference pose": reference.pose, "reference velocity": reference.velocity,
+                "reference acceleration": reference.acceleration,
+            }
+        for name, values in needed.items():
+            if values.shape != (3,) or not np.isfinite(values).all():
+                raise ControlError(f"{name} = {values!r} is not allowed; allowed: three finite numbers")
+
+
+def _shrink(twist: FloatArray, linear: float, angular: float) -> float:
+    """Return the factor up to 1 that brings the translation within `linear` and the turn within `angular`."""
+    return 1.0 / max(1.0, math.hypot(twist[0], twist[1]) / linear, abs(twist[2]) / angular)
+
+
+def _rotation(angle: float) -> FloatArray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

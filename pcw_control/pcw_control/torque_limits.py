@@ -1,0 +1,108 @@
+"""The one place where joint torques are limited, last before they leave: a bad number ends here as zero torque.
+
+In this order:
+
+1. NaN or infinity in torque or speed: zero torque and a fault.
+2. Speed fold-back per joint: torque that accelerates a joint further fades out between `foldback_start` times the speed
+   limit and the limit itself; braking torque is never reduced.
+3. Slew limit (optional).
+4. Torque limits. Mode "scale" multiplies all torques by the one factor that brings the worst joint to its limit. Torques
+   B^T A (A^T A)^-1 F are linear in F, so the robot gets the wanted wrench in its direction, only weaker, and no internal
+   force appears. Mode "clip" cuts each joint on its own: more force, but in another direction and with the wheels
+   pushing against each other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from pcw_description.robot_description import FloatArray, RobotDescription
+
+from .errors import ControlError
+
+MODES = ("scale", "clip")
+
+
+@dataclasses.dataclass(frozen=True)
+class TorqueLimits:
+    """The limits.
+
+    Attributes:
+        torque: largest joint torques (n, 2) [N m].
+        speed: largest joint speeds (n, 2) [rad/s].
+        mode: "scale" (keep the direction of the wrench) or "clip" (each joint on its own).
+        foldback_start: fraction of the speed limit at which accelerating torque begins to fade.
+        slew: largest change of a joint torque [N m/s]; None for no limit.
+    """
+
+    torque: FloatArray
+    speed: FloatArray
+    mode: str = "scale"
+    foldback_start: float = 0.9
+    slew: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the limits.
+
+        Raises:
+            ControlError: names the field, its value and what is allowed.
+        """
+        if self.mode not in MODES:
+            raise ControlError(f"mode {self.mode!r} is not allowed; allowed: {', '.join(MODES)}")
+        for name, values in (("torque", self.torque), ("speed", self.speed)):
+            if values.ndim != 2 or values.shape != self.torque.shape or not np.all(values > 0.0):
+                raise ControlError(f"{name} limits {values!r} are not allowed; allowed: positive numbers, shape (n, 2)")
+        if not 0.0 < self.foldback_start < 1.0:
+            raise ControlError(f"foldback_start = {self.foldback_start!r} is not allowed; allowed: between 0 and 1")
+        if self.slew is not None and not self.slew > 0.0:
+            raise ControlError(f"slew = {self.slew!r} is not allowed; allowed: a positive number or None")
+
+    @classmethod
+    def of_robot(cls, robot: RobotDescription, mode: str = "scale", slew: float | None = None) -> TorqueLimits:
+        """Return the limits that the robot's description states."""
+        return cls(robot.torque_limit, robot.speed_limit, mode=mode, slew=slew)
+
+
+@dataclasses.dataclass(frozen=True)
+class LimitedTorque:
+    """What may be sent.
+
+    Attributes:
+        torque: joint torques (n, 2) [N m], finite and within the limits.
+        fault: the request or the measured speed held NaN or infinity, and the torque is zero.
+        saturated: the torque is less than what was asked for, so that an integrator should hold.
+    """
+
+    torque: FloatArray
+    fault: bool
+    saturated: bool
+
+
+def limit_torque(
+    limits: TorqueLimits, previous_torque: FloatArray, torque: FloatArray, joint_velocity: FloatArray, dt: float
+) -> LimitedTorque:
+    """Return the torque that may be sent; its `torque` is the next `previous_torque`, the only state there is.
+
+    Args:
+        limits: the limits.
+        previous_torque: torque sent before (n, 2) [N m], for the slew limit.
+        torque: torque asked for (n, 2) [N m].
+        joint_velocity: measured joint speeds (n, 2) [rad/s].
+        dt: measured time since the torque before [s].
+    """
+    if not (np.isfinite(torque).all() and np.isfinite(joint_velocity).all() and math.isfinite(dt)):
+        return LimitedTorque(np.zeros_like(limits.torque), fault=True, saturated=True)
+    fade = (1.0 - np.abs(joint_velocity) / limits.speed) / (1.0 - limits.foldback_start)
+    accelerates = torque * joint_velocity > 0.0
+    allowed = np.where(accelerates, torque * np.clip(fade, 0.0, 1.0), torque)
+    if limits.slew is not None:
+        change = limits.slew * max(dt, 0.0)
+        allowed = np.clip(allowed, previous_torque - change, previous_torque + change)
+    if limits.mode == "scale":
+        # Dividing by a ratio just above one may leave a joint a rounding error above its limit: the clip removes it.
+        allowed = allowed / max(1.0, float(np.max(np.abs(allowed) / limits.torque)))
+    allowed = np.clip(allowed, -limits.torque, limits.torque)
+    return LimitedTorque(allowed, fault=False, saturated=not np.array_equal(allowed, torque))
