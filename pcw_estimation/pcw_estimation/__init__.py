@@ -1,3 +1,6 @@
 """Estimators for powered-caster robots: encoder-consistency slip and odometry."""
 
-__all__: list[str] = []
+from .encoder_slip import EncoderSlipOutput, EncoderSlipParameters, EncoderSlipState
+from .errors import EstimationError
+
+__all__ = ["EncoderSlipOutput", "EncoderSlipParameters", "EncoderSlipState", "EstimationError"]
