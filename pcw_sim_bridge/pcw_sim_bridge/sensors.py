@@ -1,0 +1,128 @@
+"""What the sensors of a robot report of the truth that a plant computes.
+
+Encoders sit on the motors, so a joint angle is read as N^-1 (2 pi / c) round(c / 2 pi N q), with the gear matrix N and c
+counts per turn of the motor: with a steer/drive coupling the resolution of one joint depends on both encoders.
+
+The accelerometer stands at r in base_link and measures what is not gravity,
+
+    a = a_0 + alpha x r + omega x (omega x r) + g z.
+
+Rates are the caller's business: each function is called when its sensor is due. All noise comes from the `rng` given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from pcw_description.errors import DescriptionError
+from pcw_description.robot_description import FloatArray, ImuDescription, RobotDescription, TrackerDescription
+
+from .plants.plant import PlantState
+
+STANDARD_GRAVITY = 9.81  # [m/s^2], as in the plants
+VELOCITY_SOURCES = ("drive", "difference")
+
+
+@dataclasses.dataclass(frozen=True)
+class JointReading:
+    """What the drives report, joint side.
+
+    Attributes:
+        position: from the encoders (n, 2) [rad].
+        velocity: (n, 2) [rad/s].
+        effort: measured motor torque (n, 2) [N m].
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    effort: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class ImuReading:
+    """What the IMU reports, axes parallel to base_link.
+
+    Attributes:
+        angular_velocity: (3,) [rad/s].
+        linear_acceleration: (3,) [m/s^2], gravity included as +9.81 upwards.
+    """
+
+    angular_velocity: FloatArray
+    linear_acceleration: FloatArray
+
+
+class Encoders:
+    """Encoders and torque measurement of all drives.
+
+    Args:
+        robot: the robot.
+        velocity_source: "drive": the velocity that a drive's own fast observer reports, which is the truth with
+            `sensors.encoders.velocity_noise`; "difference": the difference of two readings over dt, with the same noise
+            added, as a driver without such an observer would compute.
+    """
+
+    def __init__(self, robot: RobotDescription, velocity_source: str = "drive") -> None:
+        if velocity_source not in VELOCITY_SOURCES:
+            raise DescriptionError("velocity_source", velocity_source, f"allowed: {', '.join(VELOCITY_SOURCES)}")
+        self._sensor = robot.sensors.encoders
+        self._gear = robot.gear_matrix
+        self._gear_inverse = np.linalg.inv(robot.gear_matrix)
+        self._counts_per_radian = np.array([self._sensor.drive_counts, self._sensor.steer_counts]) / math.tau
+        self._difference = velocity_source == "difference"
+
+    def counts(self, joint_position: FloatArray) -> FloatArray:
+        """Return the whole counts (n, 2) of the motors' encoders for joint angles (n, 2) [rad]."""
+        motor = np.einsum("nij,nj->ni", self._gear, joint_position)
+        return np.round(motor * self._counts_per_radian)
+
+    def position(self, counts: FloatArray) -> FloatArray:
+        """Return joint angles (n, 2) [rad] for counts (n, 2)."""
+        return np.einsum("nij,nj->ni", self._gear_inverse, counts / self._counts_per_radian)
+
+    def read(
+        self, truth: PlantState, previous: JointReading | None, dt: float, rng: np.random.Generator
+    ) -> JointReading:
+        """Return one reading.
+
+        Args:
+            truth: the plant's state.
+            previous: the reading before; None for the first, whose velocity by difference is zero.
+            dt: time since the reading before [s].
+            rng: source of the noise.
+        """
+        sensor, shape = self._sensor, truth.joint_position.shape
+        position = self.position(self.counts(truth.joint_position))
+        if not self._difference:
+            velocity = truth.joint_velocity
+        elif previous is None:
+            velocity = np.zeros(shape)
+        else:
+            velocity = (position - previous.position) / dt
+        return JointReading(
+            position=position,
+            velocity=velocity + sensor.velocity_noise * rng.standard_normal(shape),
+            effort=truth.motor_torque + sensor.torque_noise * rng.standard_normal(shape),
+        )
+
+
+def read_imu(imu: ImuDescription, truth: PlantState, rng: np.random.Generator) -> ImuReading:
+    """Return one reading of the IMU; the plants are planar in what they report, so roll and pitch are zero."""
+    r = np.array(imu.position)
+    omega = np.array([0.0, 0.0, truth.twist[2]])
+    alpha = np.array([0.0, 0.0, truth.acceleration[2]])
+    a_0 = np.array([truth.acceleration[0], truth.acceleration[1], STANDARD_GRAVITY])
+    acceleration = a_0 + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
+    return ImuReading(
+        angular_velocity=omega + imu.gyro_noise * rng.standard_normal(3),
+        linear_acceleration=acceleration + imu.accelerometer_noise * rng.standard_normal(3),
+    )
+
+
+def read_tracker(tracker: TrackerDescription, truth: PlantState, rng: np.random.Generator) -> FloatArray:
+    """Return the pose (x, y, yaw) that a tracker measures (3,) [m, m, rad]."""
+    sigma = np.array([tracker.position_noise, tracker.position_noise, tracker.yaw_noise])
+    noisy: FloatArray = truth.pose + sigma * rng.standard_normal(3)
+    return noisy
