@@ -1,0 +1,82 @@
+"""The reduced and the PyBullet plant under the same controller and the same commands: a circle and a figure-8."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement, initial_state
+from pcw_control.quintic_trajectory import TrajectoryPoint
+from pcw_description import load_robot
+from pcw_description.odometry import OdometryParameters, update
+from pcw_description.odometry import initial_state as initial_odometry
+from pcw_sim_bridge.plants.plant import make_plant
+
+DURATION = 12.0
+RAMP = 2.0
+STEPS_PER_CYCLE = 2
+
+
+def circle(angle: float) -> np.ndarray:
+    """Return a circle of 0.8 m, the robot turning with it, (x, y, yaw)."""
+    return np.array([0.8 * np.sin(angle), 0.8 * (1.0 - np.cos(angle)), angle])
+
+
+def figure8(angle: float) -> np.ndarray:
+    """Return a figure-8 of 2 m x 1 m at fixed yaw but for a slow swing, (x, y, yaw)."""
+    return np.array([np.sin(angle), 0.5 * np.sin(2.0 * angle), 0.4 * np.sin(angle)])
+
+
+def reference(path: Callable[[float], np.ndarray], rate: float, time: float) -> TrajectoryPoint:
+    """Return the point of a path run at `rate` [rad/s] after a smooth start, derivatives by central differences."""
+
+    def phase(t: float) -> float:
+        if t >= RAMP:
+            return rate * (t - RAMP / 2)
+        x = max(t, 0.0) / RAMP
+        return rate * RAMP * x**4 * (2.5 + x * (-3.0 + x))  # its rate rises from 0 to `rate` with zero acceleration at both ends
+
+    h = 1e-4
+    before, now, after = (path(phase(time + shift)) for shift in (-h, 0.0, h))
+    return TrajectoryPoint(now, (after - before) / (2 * h), (after - 2 * now + before) / h**2)
+
+
+def drive(plant_name: str, path: Callable[[float], np.ndarray], rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return true poses (T, 3) and slip velocities (T, n, 2) of a closed-loop run from encoders alone."""
+    robot = load_robot("thesis")
+    plant = make_plant(plant_name, robot)
+    start = path(0.0)
+    tangent = path(1e-3) - start
+    plant.reset(pose=start, steer_angle=np.full(robot.n, np.arctan2(tangent[1], tangent[0])))
+    controller = ComputedTorque(robot)
+    control, odometry = initial_state(), initial_odometry(start)
+    parameters = OdometryParameters()
+    dt = STEPS_PER_CYCLE * plant.dt
+    poses, slips = [], []
+    try:
+        for cycle in range(round(DURATION / dt)):
+            state = plant.state()
+            odometry, _ = update(robot, parameters, odometry, state.joint_position, dt)
+            measurement = ComputedTorqueMeasurement(state.joint_position, state.joint_velocity, odometry.pose)
+            control, output = controller.step(control, measurement, reference(path, rate, cycle * dt), dt)
+            plant.step(output.torque, STEPS_PER_CYCLE)
+            poses.append(state.pose)
+            slips.append(state.slip)
+    finally:
+        plant.close()
+    return np.array(poses), np.array(slips)
+
+
+@pytest.mark.parametrize(("path", "rate"), [(circle, 0.75), (figure8, 0.75)])
+def test_closed_loop_runs_agree(path: Callable[[float], np.ndarray], rate: float) -> None:
+    """Poses stay within 1 mm and slip velocities within 20 % (RMS over the run) of each other, at 0.6 to 1 m/s."""
+    reduced_pose, reduced_slip = drive("reduced", path, rate)
+    bullet_pose, bullet_slip = drive("pybullet", path, rate)
+    apart = np.hypot(*(bullet_pose - reduced_pose)[:, :2].T)
+    slip_size = np.sqrt(np.mean(reduced_slip**2))
+    slip_apart = np.sqrt(np.mean((bullet_slip - reduced_slip) ** 2))
+    travelled = np.sum(np.hypot(*np.diff(reduced_pose[:, :2], axis=0).T))
+    print(f"\n{path.__name__}: {travelled:.1f} m, pose within {1e3 * apart.max():.3f} mm, slip {1e3 * slip_size:.2f} mm/s RMS, "
+          f"apart {100 * slip_apart / slip_size:.1f} %")
+    assert travelled > 5.0
+    assert apart.max() < 1e-3
+    assert slip_apart < 0.2 * slip_size
