@@ -129,7 +129,7 @@ step() {
   since="$(now)"
   say "$label ..."
   printf '\n### %s: %s\n' "$label" "$*" >> "$log"
-  (while sleep 10 && kill -0 $$; do say "  ... $(elapsed "$since") s"; done) 9>&- < /dev/null > /dev/null &
+  (while sleep 10 2> /dev/null && kill -0 $$; do say "  ... $(elapsed "$since") s"; done) 9>&- < /dev/null > /dev/null &
   heartbeat=$!
   "$@" >> "$log" 2>&1 9>&- < /dev/null || code=$?
   stop_heartbeat
@@ -313,7 +313,7 @@ install_lock() {
 warn_of_compiling() {
   [[ "$("$venv/bin/python" -I -S -c 'import sys; print(sys.version_info[1])')" -ge 12 ]] || return 0
   grep -q '^pybullet==' "$1" || return 0
-  say "pybullet has no wheel for this Python and is compiled from source, once on this machine: 4-5 minutes on two cores"
+  say "pybullet has no wheel for this Python and is compiled from source, once on this machine: four minutes or more on two cores"
   local include
   include="$("$venv/bin/python" -I -c 'import sysconfig; print(sysconfig.get_path("include"))')"
   if ! command -v c++ > /dev/null && ! command -v g++ > /dev/null || [[ ! -f "$include/Python.h" ]]; then
