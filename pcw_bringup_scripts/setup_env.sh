@@ -313,6 +313,7 @@ install_lock() {
 warn_of_compiling() {
   [[ "$("$venv/bin/python" -I -S -c 'import sys; print(sys.version_info[1])')" -ge 12 ]] || return 0
   grep -q '^pybullet==' "$1" || return 0
+  compgen -G "$venv/lib/python3*/site-packages/pybullet-*.dist-info" > /dev/null && return 0
   say "pybullet has no wheel for this Python and is compiled from source, once on this machine: four minutes or more on two cores"
   local include
   include="$("$venv/bin/python" -I -c 'import sysconfig; print(sysconfig.get_path("include"))')"

@@ -20,8 +20,8 @@ MODULE_OF = {"pybullet": "pybullet", "pin": "pinocchio"}
 
 def entries(lock_text: str) -> list[tuple[str, str]]:
     """Return (distribution name, whole entry with its hashes) for each requirement of the lock file."""
-    joined = re.findall(r"^([A-Za-z0-9][\w.-]*)(==.*(?:\\\n.*)*)$", lock_text, flags=re.MULTILINE)
-    return [(name, name + rest) for name, rest in joined]
+    found = re.findall(r"^([A-Za-z0-9][\w.-]*)(==[^\\\n]*(?:\\\n[^\\\n]*)*)$", lock_text, flags=re.MULTILINE)
+    return [(name, name + rest) for name, rest in found]
 
 
 def is_installed(name: str) -> bool:

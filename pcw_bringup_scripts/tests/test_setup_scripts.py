@@ -6,6 +6,7 @@ import os
 import shutil
 import stat
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -168,6 +169,16 @@ def test_a_second_set_up_waits_for_the_first(empty_clone):
     )
     waiting, failing = done.stderr.find("waiting for it"), done.stderr.find("does not run")
     assert 0 <= waiting < failing
+
+
+def test_only_what_the_system_lacks_is_installed_on_top_of_ros(tmp_path):
+    """pytest is here and stays the system's; ROS never comes from a wheel; what is missing keeps its marker and its hashes."""
+    digest = "0" * 64
+    missing = f"no-such-thing==1.0 ; sys_platform == 'win32' \\\n    --hash=sha256:{digest} \\\n    --hash=sha256:{digest}\n"
+    lock = tmp_path / "lock.txt"
+    lock.write_text(f"pytest==8.0 \\\n    --hash=sha256:{digest}\nros-rclpy==1.0 \\\n    --hash=sha256:{digest}\n{missing}")
+    command = [sys.executable, str(SCRIPTS / "requirements/select_missing.py"), str(lock)]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == missing
 
 
 def test_another_ros_in_the_shell_is_left_behind(empty_clone):
