@@ -35,7 +35,7 @@ class Quantity:
     def allowed(self) -> str:
         """Return the allowed range in words."""
         kind = "a number" if self.length is None else f"a list of {self.length} numbers"
-        parts = [f"{kind} in {self.unit}" if self.unit else kind]
+        parts = [f"{kind} in {self.unit}" if self.unit not in ("", "1") else kind]
         if self.above > -math.inf:
             parts.append(f"above {self.above:g}")
         if self.minimum > -math.inf:
@@ -75,7 +75,7 @@ class _Loader(yaml.SafeLoader):
             key = self.construct_object(key_node, deep=True)
             if key in seen:
                 line = key_node.start_mark.line + 1
-                raise DescriptionError(str(key), f"line {line}", "allowed: each key once")
+                raise DescriptionError(f"line {line}", key, "it stands there a second time; allowed: each key once")
             seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -97,14 +97,15 @@ def load_yaml_mapping(path: str | Path) -> dict[str, Any]:
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # noqa: S506 - a SafeLoader
     except OSError as error:
-        raise DescriptionError(str(path), error.strerror or "unreadable", "allowed: a readable YAML file") from None
+        raise DescriptionError("file", str(path), f"{error.strerror or error}; allowed: a readable YAML file") from None
     except UnicodeDecodeError:
-        raise DescriptionError(str(path), "binary data", "allowed: a YAML text file") from None
+        raise DescriptionError("file", str(path), "it is not text; allowed: a YAML file") from None
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
-        raise DescriptionError(str(path), problem, "allowed: valid YAML") from None
+        raise DescriptionError("file", str(path), f"it is not YAML ({problem}); allowed: valid YAML") from None
     if not isinstance(content, dict):
-        raise DescriptionError(str(path), type(content).__name__, "allowed: a mapping of keys to values")
+        found = "nothing" if content is None else f"one {type(content).__name__}"
+        raise DescriptionError("file", str(path), f"it holds {found}; allowed: a mapping of keys to values")
     return content
 
 
@@ -112,7 +113,7 @@ def read_number(value: object, key: str, spec: Quantity) -> float:
     """Check one number against its declaration and return it as float."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DescriptionError(key, value, spec.allowed())
-    number = float(value)
+    number = float(value) if abs(value) < 1e300 else math.inf  # an integer of 400 digits has no float
     if not math.isfinite(number) or number < spec.minimum or number > spec.maximum or number <= spec.above:
         raise DescriptionError(key, value, spec.allowed())
     return number
@@ -144,7 +145,7 @@ def read_section(cls: type[Any], data: object, key: str) -> Any:
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if data.get(name) is None:
             if required:
-                raise DescriptionError(where, None, f"required key is missing; {_describe(field)}")
+                raise DescriptionError(where, None, _describe(field))
             continue
         values[name] = _read_value(data[name], where, field, hints[name])
     return cls(**values)
@@ -164,7 +165,7 @@ def _read_value(value: object, where: str, field: dataclasses.Field[Any], hint: 
         return read_section(hint, value, where)  # type: ignore[arg-type]
     if hint is str:
         choices = field.metadata.get("choices") or ()
-        if not isinstance(value, str) or (choices and value not in choices):
+        if not isinstance(value, str) or not value.strip() or (choices and value not in choices):
             near = nearest_name(str(value), choices) if choices else "allowed: text"
             raise DescriptionError(where, value, near)
         return value
@@ -183,7 +184,10 @@ def _describe(field: dataclasses.Field[Any]) -> str:
 
 
 def document(cls: type[Any], key: str = "") -> list[tuple[str, str, str, str]]:
-    """Return the documentation of a format as rows (key, unit, allowed range, meaning), nested sections included."""
+    """Return the documentation of a format as rows (key, unit, allowed, meaning).
+
+    Nested sections are included, and the entries of a list of sections under `key[]`.
+    """
     rows: list[tuple[str, str, str, str]] = []
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
@@ -192,17 +196,21 @@ def document(cls: type[Any], key: str = "") -> list[tuple[str, str, str, str]]:
         name = f"{key}.{field.name}" if key else field.name
         spec: Quantity | None = field.metadata.get("quantity")
         hint = hints[field.name]
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        has_number = isinstance(field.default, (int, float))
+        optional = "" if required else f"default {field.default:g}" if has_number else "optional"
         if isinstance(hint, types.UnionType):
             hint = next(member for member in typing.get_args(hint) if member is not type(None))
         if spec is not None:
-            required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
             allowed = spec.allowed().removeprefix("allowed: ")
-            if not required and field.default is not None:
-                allowed += f"; default {field.default}"
-            rows.append((name, spec.unit, allowed, spec.help))
-        else:
-            choices = field.metadata.get("choices") or ()
-            rows.append((name, "", ", ".join(choices), str(field.metadata.get("help", ""))))
-            if dataclasses.is_dataclass(hint):
-                rows.extend(document(hint, name))  # type: ignore[arg-type]
+            rows.append((name, spec.unit, "; ".join(filter(None, (allowed, optional))), spec.help))
+            continue
+        choices = ", ".join(field.metadata.get("choices") or ())
+        is_text = "text" if hint is str and not choices else ""
+        rows.append((name, "", "; ".join(filter(None, (choices, is_text, optional))), str(field.metadata.get("help", ""))))
+        items = typing.get_args(hint)
+        if typing.get_origin(hint) is tuple and items and dataclasses.is_dataclass(items[0]):
+            name, hint = f"{name}[]", items[0]
+        if dataclasses.is_dataclass(hint) and any(f.metadata for f in dataclasses.fields(hint)):
+            rows.extend(document(hint, name))  # type: ignore[arg-type]
     return rows

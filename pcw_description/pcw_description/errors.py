@@ -5,6 +5,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+# A value longer than this is cut in a message, a suggestion among more names than this does without their list.
+LONGEST_VALUE = 100
+MOST_NAMES = 16
+
 
 class PcwError(ValueError):
     """Base of all PCW errors."""
@@ -20,7 +24,10 @@ class DescriptionError(PcwError):
         self.key = key
         self.value = value
         self.allowed = allowed
-        super().__init__(f"{key}: {value!r} is not allowed; {allowed}")
+        found = repr(value)
+        if len(found) > LONGEST_VALUE:
+            found = found[:LONGEST_VALUE] + "..."
+        super().__init__(f"{key} is missing; {allowed}" if value is None else f"{key}: {found} is not allowed; {allowed}")
 
 
 class KinematicsError(PcwError):
@@ -32,9 +39,11 @@ class RecordingError(PcwError):
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:
-    """Return `"; did you mean 'x'?"` for the known name nearest to `name`, or the list of all of them."""
+    """Return "did you mean 'x'? allowed: w, x, y", or the list alone where no known name is near."""
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    if close:
-        return f"did you mean {close[0]!r}?"
-    return "known: " + ", ".join(names)
+    everything = "allowed: " + ", ".join(names)
+    if not close:
+        return everything
+    suggestion = f"did you mean {close[0]!r}?"
+    return f"{suggestion} {everything}" if len(names) <= MOST_NAMES else suggestion

@@ -130,7 +130,7 @@ class Limits:
 class Caster:
     """One powered caster wheel."""
 
-    name: str = text("name of the caster; its joints are <name>_steer and <name>_drive")
+    name: str = text("name of the caster; its joints are NAME_steer and NAME_drive")
     steer_axis: tuple[float, float] = quantity(
         "m", "steering axis in base_link", length=2, minimum=-10.0, maximum=10.0, hint="a larger value may be in mm"
     )
@@ -356,9 +356,10 @@ class RobotDescription:
         for caster in self.casters:
             if abs(caster.caster_offset[0]) < MINIMUM_CASTER_OFFSET:
                 raise KinematicsError(
-                    f"{self.name}: caster {caster.name!r} has caster_offset[0] = {caster.caster_offset[0]:g} m; torque control "
-                    f"needs at least {MINIMUM_CASTER_OFFSET:g} m along the rolling direction, because the steering torque "
-                    "makes the side force through that lever arm (this robot loads for kinematics and analysis only)"
+                    f"{self.name}: caster {caster.name!r} has caster_offset[0] = {caster.caster_offset[0]:g} m; "
+                    f"torque control needs at least {MINIMUM_CASTER_OFFSET:g} m along the rolling direction, because the "
+                    "steering torque makes the side force through that lever arm (this robot loads for kinematics and "
+                    "analysis only)"
                 )
 
 
@@ -377,7 +378,9 @@ def _check_casters(casters: Sequence[Caster]) -> None:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", caster.name):
             raise DescriptionError(f"{where}.name", caster.name, "allowed: letters, digits and _, beginning with a letter")
         if names.index(caster.name) != index:
-            raise DescriptionError(f"{where}.name", caster.name, f"allowed: each name once; casters[{names.index(caster.name)}] has it")
+            raise DescriptionError(
+                f"{where}.name", caster.name, f"allowed: each name once; casters[{names.index(caster.name)}] has it"
+            )
         for earlier in range(index):
             distance = math.dist(caster.steer_axis, casters[earlier].steer_axis)
             if distance < MINIMUM_AXIS_DISTANCE:
@@ -400,16 +403,18 @@ def _check_chassis(chassis: Chassis) -> None:
             f"non-physical inertia: no body has I_xx = {xx:g}, I_yy = {yy:g}, I_zz = {zz:g} kg m^2; "
             "allowed: each at most the sum of the two others",
         )
-    # A body of twice the stated size, all its mass at the corners, bounds what the number can be.
+    # All the mass at the corners of a body of twice the stated size bounds what the number can be.
     reach = math.hypot(chassis.size[0], chassis.size[1])
     if zz > chassis.mass * reach**2:
         raise DescriptionError(
-            "chassis.inertia_zz", zz, f"non-physical inertia for {chassis.mass:g} kg within {reach:g} m; "
+            "chassis.inertia_zz", zz,
+            f"non-physical inertia for {chassis.mass:g} kg within {reach:.3g} m; "
             f"allowed: at most {chassis.mass * reach**2:.3g} kg m^2",
         )
     if zz < 1e-3 * chassis.mass * reach**2:
         raise DescriptionError(
-            "chassis.inertia_zz", zz, f"non-physical inertia for {chassis.mass:g} kg spread over {reach:g} m (a placeholder?); "
+            "chassis.inertia_zz", zz,
+            f"non-physical inertia for {chassis.mass:g} kg spread over {reach:.3g} m (a placeholder?); "
             f"allowed: at least {1e-3 * chassis.mass * reach**2:.3g} kg m^2",
         )
 
@@ -425,7 +430,8 @@ def _check_module(caster: Caster, where: str) -> None:
     module = caster.module
     if wheel.mass >= module.mass:
         raise DescriptionError(
-            f"{where}.wheel.mass", wheel.mass, f"allowed: below module.mass = {module.mass:g} kg, which is fork and wheel together"
+            f"{where}.wheel.mass", wheel.mass,
+            f"allowed: below module.mass = {module.mass:g} kg, which is fork and wheel together",
         )
     least = thinnest_module_inertia(caster)
     if module.inertia_zz <= least:
@@ -494,13 +500,16 @@ def parse_robot(data: Mapping[str, Any]) -> RobotDescription:
     Raises:
         DescriptionError: names the key, the value and what is allowed.
     """
+    if not isinstance(data, Mapping):
+        raise DescriptionError("robot description", data, "allowed: a mapping of keys to values")
     content = dict(data)
     found = content.get("format")
     if found != FORMAT:
         raise DescriptionError("format", found, f"allowed: {FORMAT}")
-    defaults = content.pop("caster_defaults", {}) or {}
+    defaults = content.pop("caster_defaults", None)
+    defaults = {} if defaults is None else defaults
     if not isinstance(defaults, Mapping):
-        raise DescriptionError("caster_defaults", defaults, "allowed: a mapping, the same keys as a caster")
+        raise DescriptionError("caster_defaults", defaults, "allowed: a mapping with the keys of a caster")
     casters = content.get("casters")
     if not isinstance(casters, list):
         raise DescriptionError("casters", casters, "allowed: a list of casters")
@@ -508,20 +517,35 @@ def parse_robot(data: Mapping[str, Any]) -> RobotDescription:
         read_section(Caster, _merged(defaults, item, f"casters[{index}]"), f"casters[{index}]")
         for index, item in enumerate(casters)
     )
-    provenance = content.get("provenance")
-    if not isinstance(provenance, Mapping) or not provenance:
-        raise DescriptionError("provenance", provenance, "allowed: a mapping that says where each number comes from")
-    content["provenance"] = {str(name): str(source) for name, source in provenance.items()}
-    content["tolerances"] = read_tolerances(content.get("tolerances") or {}, DEFAULT_TOLERANCES)
+    content["provenance"] = _read_provenance(content.get("provenance"))
+    tolerances, physics = content.get("tolerances"), content.get("physics")
+    content["tolerances"] = {} if tolerances is None else read_tolerances(tolerances, DEFAULT_TOLERANCES)
     names = [caster.name for caster in content["casters"]]
-    content["physics"] = read_physics(content.get("physics") or [], names)
-    shape = (content.get("contact") or {}).get("shape") if isinstance(content.get("contact"), Mapping) else None
-    if shape is not None and not (
-        isinstance(shape, Mapping) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in shape.values())
-    ):
-        raise DescriptionError("contact.shape", shape, "allowed: a mapping of names to numbers")
+    content["physics"] = () if physics is None else read_physics(physics, names)
+    contact = content.get("contact")
+    shape = contact.get("shape") if isinstance(contact, Mapping) else None
+    if shape is not None and not (isinstance(shape, Mapping) and all(_is_number(value) for value in shape.values())):
+        raise DescriptionError("contact.shape", shape, "allowed: a mapping of names to finite numbers")
     robot: RobotDescription = read_section(RobotDescription, content, "")
+    # Only the friction curve knows the names of its shape numbers; it needs this module first.
+    from .contact.contact_model import tyre_parameters
+
+    tyre_parameters(robot.contact)
     return robot
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _read_provenance(provenance: object) -> dict[str, str]:
+    allowed = "allowed: a mapping that says where each number comes from, its source or 'assumed' with the reason"
+    if not isinstance(provenance, Mapping) or not provenance:
+        raise DescriptionError("provenance", provenance, allowed)
+    for name, source in provenance.items():
+        if not isinstance(source, str) or not source.strip():
+            raise DescriptionError(f"provenance.{name}", source, "allowed: text, a source or 'assumed' with the reason")
+    return {str(name): source for name, source in provenance.items()}
 
 
 def _merged(defaults: Mapping[str, Any], own: object, where: str) -> dict[str, Any]:
@@ -560,7 +584,8 @@ def load_robot(robot: str | Path) -> RobotDescription:
     if path.suffix not in (".yaml", ".yml"):
         names = shipped_robots()
         if str(robot) not in names:
-            raise DescriptionError("robot", str(robot), f"a path of a .yaml file, or a shipped robot; {nearest_name(str(robot), names)}")
+            near = nearest_name(str(robot), names)
+            raise DescriptionError("robot", str(robot), f"neither a .yaml file nor a shipped robot; {near}")
         path = robots_directory() / f"{robot}.yaml"
     return parse_robot(load_yaml_mapping(path))
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -62,7 +63,9 @@ def split_module(caster: Caster, where: str = "module") -> ModuleSplit:
     module, wheel = caster.module, caster.wheel
     fork_mass = module.mass - wheel.mass
     if fork_mass <= 0.0:
-        raise DescriptionError(f"{where}.module.mass", module.mass, f"allowed: above wheel.mass = {wheel.mass:g} kg (the fork has mass)")
+        raise DescriptionError(
+            f"{where}.module.mass", module.mass, f"allowed: above wheel.mass = {wheel.mass:g} kg (the fork has mass)"
+        )
     fork_com = tuple(
         (module.mass * c - wheel.mass * b) / fork_mass for c, b in zip(module.com, caster.caster_offset, strict=True)
     )
@@ -117,24 +120,23 @@ def _add_caster(root: ElementTree.Element, caster: Caster, where: str) -> None:
     # Only the vertical axis is in the description; equal moments are those of a body that can exist.
     _inertial(fork, split.fork_mass, (*split.fork_com, 0.0), (zz, zz, zz))
     side = caster.caster_offset[1] + 0.5 * wheel.width + BLADE_THICKNESS
-    _visual(fork, "fork", (0.0, 0.0, radius), (0.0, 0.0, 0.0), "cylinder", radius=_text(COLUMN_RADIUS), length=_text(0.6 * radius))
-    _visual(
-        fork, "fork", (0.5 * caster.caster_offset[0], side, 0.35 * radius), (0.0, 0.0, 0.0), "box",
-        size=_text(abs(caster.caster_offset[0]) + 0.5 * radius, BLADE_THICKNESS, 0.9 * radius),
-    )
+    column = {"radius": _text(COLUMN_RADIUS), "length": _text(0.6 * radius)}
+    _visual(fork, "fork", (0.0, 0.0, radius), (0.0, 0.0, 0.0), "cylinder", **column)
+    blade = _text(abs(caster.caster_offset[0]) + 0.5 * radius, BLADE_THICKNESS, 0.9 * radius)
+    _visual(fork, "fork", (0.5 * caster.caster_offset[0], side, 0.35 * radius), (0.0, 0.0, 0.0), "box", size=blade)
     _joint(
-        root, f"{name}_steer", "continuous", "base_link", fork.get("name", ""), (*caster.steer_axis, radius), (0.0, 0.0, 1.0),
+        root, f"{name}_steer", "continuous", "base_link", f"{name}_fork", (*caster.steer_axis, radius), (0.0, 0.0, 1.0),
         (caster.limits.steer_torque, caster.limits.steer_speed),
     )
     tyre = _link(root, f"{name}_wheel")
-    diameter_inertia = split.wheel_inertia_zz
-    _inertial(tyre, wheel.mass, (0.0, 0.0, 0.0), (diameter_inertia, wheel.inertia_axle, diameter_inertia))
-    quarter_turn = 1.5707963267948966
-    _visual(tyre, "wheel", (0.0, 0.0, 0.0), (quarter_turn, 0.0, 0.0), "cylinder", radius=_text(radius), length=_text(wheel.width))
+    _inertial(tyre, wheel.mass, (0.0, 0.0, 0.0), (split.wheel_inertia_zz, wheel.inertia_axle, split.wheel_inertia_zz))
+    tread = {"radius": _text(radius), "length": _text(wheel.width)}
+    _visual(tyre, "wheel", (0.0, 0.0, 0.0), (0.5 * math.pi, 0.0, 0.0), "cylinder", **tread)
     # A spoke, so that rolling can be seen.
-    _visual(tyre, "fork", (0.0, 0.0, 0.5 * radius), (0.0, 0.0, 0.0), "box", size=_text(0.1 * radius, 1.1 * wheel.width, 0.6 * radius))
+    spoke = _text(0.1 * radius, 1.1 * wheel.width, 0.6 * radius)
+    _visual(tyre, "fork", (0.0, 0.0, 0.5 * radius), (0.0, 0.0, 0.0), "box", size=spoke)
     _joint(
-        root, f"{name}_drive", "continuous", fork.get("name", ""), f"{name}_wheel", (*caster.caster_offset, 0.0), (0.0, 1.0, 0.0),
+        root, f"{name}_drive", "continuous", f"{name}_fork", f"{name}_wheel", (*caster.caster_offset, 0.0), (0.0, 1.0, 0.0),
         (caster.limits.drive_torque, caster.limits.drive_speed),
     )
 

@@ -17,7 +17,9 @@ EFFECT = JointTorqueEffect(
     summary="A constant torque against the drive, the same at rest, forwards and backwards.",
     sentence="A constant load of {load:.3g} N m against the drive of {target}.",
     parameters=(
-        EffectParameter("load", "N m", "torque needed to hold against it; negative helps forwards", -1e4, 1e4, 1.0, linear=True),
+        EffectParameter(
+            "load", "N m", "torque needed to hold against it; negative helps forwards", -1e4, 1e4, 1.0, linear=True
+        ),
     ),
     sensors=("joint_states",),
     look_alikes=("ground_slope", "torque_constant_error"),

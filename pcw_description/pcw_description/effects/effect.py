@@ -8,7 +8,6 @@ A third party adds one by a module with a module-level `EFFECT`, in this folder 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +92,8 @@ class Effect:
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter
-        raise DescriptionError(f"{self.name}.{name}", name, nearest_name(name, [p.name for p in self.parameters]))
+        near = nearest_name(name, [parameter.name for parameter in self.parameters])
+        raise DescriptionError(f"effect {self.name}", name, f"unknown parameter; {near}")
 
     @property
     def linear_parameters(self) -> tuple[EffectParameter, ...]:
@@ -118,12 +118,12 @@ class Effect:
         checked = {}
         for parameter in self.parameters:
             value = parameters.get(parameter.name, parameter.default)
-            allowed = f"allowed: {parameter.lower:g} to {parameter.upper:g} {parameter.unit} ({parameter.help})"
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            allowed = f"allowed: {parameter.lower:g} to {parameter.upper:g}{unit} ({parameter.help})"
             if value is None:
-                raise DescriptionError(f"{where}.{parameter.name}", None, f"required parameter is missing; {allowed}")
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise DescriptionError(f"{where}.{parameter.name}", value, allowed)
-            if not parameter.lower <= value <= parameter.upper:
+                raise DescriptionError(f"{where}.{parameter.name}", None, allowed)
+            is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not (is_number and parameter.lower <= value <= parameter.upper):  # NaN fails the comparison as well
                 raise DescriptionError(f"{where}.{parameter.name}", value, allowed)
             checked[parameter.name] = float(value)
         return checked

@@ -18,7 +18,9 @@ EFFECT = JointTorqueEffect(
     target_kind="caster",
     axis="drive",
     summary="Torque ripple tied to the angle of the motor: magnets pulling on the slots.",
-    sentence="Cogging of order {order:.4g} per radian with cosine {cosine:.3g} and sine {sine:.3g} N m in the drive of {target}.",
+    sentence=(
+        "Cogging of order {order:.4g} per radian with cosine {cosine:.3g} and sine {sine:.3g} N m in the drive of {target}."
+    ),
     parameters=(
         EffectParameter("cosine", "N m", "cosine part of the ripple", -1e4, 1e4, 0.2, linear=True),
         EffectParameter("sine", "N m", "sine part of the ripple", -1e4, 1e4, 0.2, default=0.0, linear=True),

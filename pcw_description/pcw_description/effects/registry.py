@@ -24,11 +24,23 @@ def all_effects() -> Mapping[str, Effect]:
     for module_info in pkgutil.iter_modules(package.__path__):
         if module_info.name not in _NOT_EFFECTS:
             effect = importlib.import_module(f"{package.__name__}.{module_info.name}").EFFECT
-            effects[effect.name] = effect
+            _add(effects, effect, f"{package.__name__}.{module_info.name}")
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
-        effect = entry_point.load()
-        effects[effect.name] = effect
+        _add(effects, entry_point.load(), entry_point.value)
     return dict(sorted(effects.items()))
+
+
+def _add(effects: dict[str, Effect], effect: object, origin: str) -> None:
+    """Take an effect into the vocabulary.
+
+    Raises:
+        DescriptionError: not an effect, or a second one of its name, which would silently change what a name means.
+    """
+    if not isinstance(effect, Effect):
+        raise DescriptionError(f"effect {origin}", effect, "allowed: an instance of Effect")
+    if effect.name in effects:
+        raise DescriptionError(f"effect {origin}", effect.name, "another effect has this name; allowed: each name once")
+    effects[effect.name] = effect
 
 
 def get(name: str) -> Effect:
@@ -59,10 +71,10 @@ def read_physics(entries: object, caster_names: Sequence[str]) -> tuple[EffectIn
     for index, entry in enumerate(entries):
         where = f"physics[{index}]"
         if not isinstance(entry, Mapping) or "name" not in entry:
-            raise DescriptionError(where, entry, "allowed: a mapping with name, target and parameters")
+            raise DescriptionError(where, entry, "allowed: a mapping with name, target and the parameters of the effect")
         name = entry["name"]
         effects = all_effects()
-        if name not in effects:
+        if not isinstance(name, str) or name not in effects:
             raise DescriptionError(f"{where}.name", name, f"unknown effect; {nearest_name(str(name), effects)}")
         effect = effects[name]
         target = _read_target(entry.get("target"), effect, caster_names, where)
@@ -81,4 +93,6 @@ def _read_target(target: object, effect: Effect, caster_names: Sequence[str], wh
     for name in names:
         if name not in allowed:
             raise DescriptionError(f"{where}.target", name, nearest_name(str(name), allowed))
+    if len(set(names)) < len(names):
+        raise DescriptionError(f"{where}.target", list(names), "allowed: each target once")
     return tuple(str(name) for name in names)

@@ -25,6 +25,8 @@ EFFECT = JointTorqueEffect(
     ),
     sensors=("joint_states",),
     look_alikes=("drive_coulomb_friction",),
-    separating_experiment="load the wheels unevenly (shift a payload): rolling resistance follows the load, drive friction does not",
+    separating_experiment=(
+        "load the wheels unevenly (shift a payload): rolling resistance follows the load, drive friction does not"
+    ),
     torque=rolling_resistance_torque,
 )
