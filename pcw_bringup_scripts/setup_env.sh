@@ -47,7 +47,7 @@ _pcw_activate() {
     _pcw_leave_other_ros
   fi
   export VIRTUAL_ENV="$root/.venv"
-  case ":$PATH:" in *":$VIRTUAL_ENV/bin:"*) ;; *) export PATH="$VIRTUAL_ENV/bin:$PATH" ;; esac
+  case "$PATH:" in "$VIRTUAL_ENV/bin:"*) ;; *) export PATH="$VIRTUAL_ENV/bin:$PATH" ;; esac
   # shellcheck disable=SC1091
   source "$root/.colcon/install/local_setup.bash"
   # Nodes of one robot on one machine: no multicast leaves it, and they find each other at once. Set these to reach further.

@@ -22,8 +22,11 @@ set_up_here = pytest.mark.skipif(
 
 
 def clean_environment(**changes: str) -> dict[str, str]:
-    """This process's environment without what the set-up itself has put there, so that a run starts as from a new shell."""
-    ours = ("PCW_", "ROS_", "RMW_", "FASTRTPS_", "AMENT_", "COLCON_", "VIRTUAL_ENV", "PYTHONPATH", "PIP_FIND_LINKS")
+    """This process's environment without what the set-up itself has put there, so that a run starts as from a new shell.
+
+    The user's PCW_PYTHON and PCW_ROS_SETUP stay: without them a run in this clone would set it up anew, otherwise.
+    """
+    ours = ("ROS_", "RMW_", "FASTRTPS_", "AMENT_", "COLCON_", "VIRTUAL_ENV", "PYTHONPATH", "PIP_FIND_LINKS")
     return {**{name: value for name, value in os.environ.items() if not name.startswith(ours)}, **changes}
 
 
@@ -140,6 +143,7 @@ def test_no_fitting_python_at_all(empty_clone):
         cwd=empty_clone,
         PATH=f"{tools}{os.pathsep}{os.environ['PATH']}",
         PCW_ROS_SETUP="none",
+        PCW_PYTHON="",
     )
     assert done.returncode == 1
     assert "No Python 3.11 or 3.12 found (tried: python3.11 python3.12 python3 python)" in done.stderr
