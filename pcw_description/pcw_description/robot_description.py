@@ -59,11 +59,13 @@ class Chassis:
         length, width, height = self.size
         box_xx = self.mass * (width**2 + height**2) / 12.0
         box_yy = self.mass * (length**2 + height**2) / 12.0
-        # A box of that size may contradict the stated I_zz; stretching the two keeps the triangle inequality.
-        stretch = max(1.0, 1.001 * self.inertia_zz / (box_xx + box_yy))
+        # A box of that size may contradict the stated I_zz; then the two move as little as the triangle inequality asks.
+        half_sum = max(0.5 * (box_xx + box_yy), 0.5005 * self.inertia_zz)
+        half_difference = 0.5 * (box_xx - box_yy)
+        half_difference = math.copysign(min(abs(half_difference), 0.4995 * self.inertia_zz), half_difference)
         return (
-            self.inertia_xx if self.inertia_xx is not None else box_xx * stretch,
-            self.inertia_yy if self.inertia_yy is not None else box_yy * stretch,
+            self.inertia_xx if self.inertia_xx is not None else half_sum + half_difference,
+            self.inertia_yy if self.inertia_yy is not None else half_sum - half_difference,
             self.inertia_zz,
         )
 
@@ -396,13 +398,7 @@ def _check_casters(casters: Sequence[Caster]) -> None:
 
 
 def _check_chassis(chassis: Chassis) -> None:
-    xx, yy, zz = chassis.principal_inertias()
-    if zz > xx + yy or xx > yy + zz or yy > xx + zz:
-        raise DescriptionError(
-            "chassis.inertia_zz", zz,
-            f"non-physical inertia: no body has I_xx = {xx:g}, I_yy = {yy:g}, I_zz = {zz:g} kg m^2; "
-            "allowed: each at most the sum of the two others",
-        )
+    zz = chassis.inertia_zz
     # All the mass at the corners of a body of twice the stated size bounds what the number can be.
     reach = math.hypot(chassis.size[0], chassis.size[1])
     if zz > chassis.mass * reach**2:
@@ -416,6 +412,13 @@ def _check_chassis(chassis: Chassis) -> None:
             "chassis.inertia_zz", zz,
             f"non-physical inertia for {chassis.mass:g} kg spread over {reach:.3g} m (a placeholder?); "
             f"allowed: at least {1e-3 * chassis.mass * reach**2:.3g} kg m^2",
+        )
+    xx, yy, _ = chassis.principal_inertias()
+    if zz > xx + yy or xx > yy + zz or yy > xx + zz:
+        raise DescriptionError(
+            "chassis.inertia_zz", zz,
+            f"non-physical inertia: no body has I_xx = {xx:g}, I_yy = {yy:g}, I_zz = {zz:g} kg m^2; "
+            "allowed: each at most the sum of the two others",
         )
 
 

@@ -154,8 +154,8 @@ class JointTorqueEffect(Effect):
         parameters: Mapping[str, float],
     ) -> FloatArray:
         """Evaluate the kernel along a recording; all arrays (T,), result (T,) [N m]."""
-        arrays = (np.ascontiguousarray(a, dtype=float) for a in (position, velocity, motor_torque, normal_force))
-        torque: FloatArray = joint_torque_along(joint_torque_list([self.torque]), *arrays, self.values(parameters))
+        q, v, tau, load = (np.ascontiguousarray(a, dtype=float) for a in (position, velocity, motor_torque, normal_force))
+        torque: FloatArray = joint_torque_along(joint_torque_list([self.torque]), q, v, tau, load, self.values(parameters))
         return torque
 
     def regressor(
