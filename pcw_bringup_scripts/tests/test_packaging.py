@@ -28,6 +28,7 @@ MAY_STAND_AT_THE_TOP = {*PACKAGES, "README.md", "LICENSE"}
 KEY_OF_MODULE = {
     "can": "python3-can",
     "jinja2": "python3-jinja2",
+    "lz4": "mcap-ros2-support",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
     "mcap_ros2": "mcap-ros2-support",
@@ -38,6 +39,7 @@ KEY_OF_MODULE = {
     "rosbags": "python3-rosbags-pip",
     "scipy": "python3-scipy",
     "yaml": "python3-yaml",
+    "zstandard": "mcap-ros2-support",
 }
 # Needed without being imported by the Python package itself.
 NOT_IMPORTED = {"launch", "launch_ros", "ros2launch"}
@@ -158,9 +160,8 @@ def test_what_a_readme_names_is_there(readme):
 @pytest.mark.parametrize("package", PACKAGES)
 def test_installation_holds_every_file_of_the_sources(package):
     """A folder without `__init__.py`, or a template that package_data does not name, is missing from an installation."""
-    module = __import__(package)
-    source, installed = REPOSITORY / package / package, Path(str(module.__file__)).parent
-    assert installed != source, "the tests import the source tree instead of the installation"
+    source = REPOSITORY / package / package
+    [installed] = {path.parent for path in prefix_of(package).rglob(f"*-packages/{package}/__init__.py")}
 
     def files(folder: Path) -> set[str]:
         return {
