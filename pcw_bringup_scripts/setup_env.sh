@@ -93,6 +93,8 @@ _pcw_setup() {
     esac
     shift
   done
+  # Both end in the first line of every executable or in PYTHONPATH, where they would cut the path in two.
+  [[ "$root" != *[[:space:]:]* ]] || fail "There is a space or a colon in the path of this clone: $root" "Clone into another folder."
   mkdir -p "$colcon/log" || fail "Cannot write into $root." "Clone into a folder that you may write to."
   touch "$colcon/COLCON_IGNORE"
   started="$(now)"
@@ -286,7 +288,7 @@ check_disk() {
 }
 
 pip_install() {
-  "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --require-hashes "${@:2}" -r "$1"
+  PIP_USER=0 "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --require-hashes "${@:2}" -r "$1"
 }
 
 uv_install() {

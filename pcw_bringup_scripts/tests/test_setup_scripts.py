@@ -107,6 +107,15 @@ def test_run_names_what_there_is():
     assert "no_such_executable" in done.stderr and "pcw_sim_bridge bridge" in done.stderr
 
 
+def test_a_path_with_a_space_is_refused(tmp_path):
+    """The first line of an executable cannot name an interpreter in it; without this, every node would be 'not found'."""
+    shutil.copytree(SCRIPTS, tmp_path / "my robot/pcw_bringup_scripts", ignore=shutil.ignore_patterns("__pycache__"))
+    done = bash("pcw_bringup_scripts/setup_env.sh", cwd=tmp_path / "my robot")
+    assert done.returncode == 1
+    assert "space" in done.stderr and "my robot" in done.stderr
+    assert not (tmp_path / "my robot/.colcon").exists()
+
+
 def test_a_failure_leaves_the_sourcing_shell_alive():
     done = bash("source pcw_bringup_scripts/setup_env.sh --no-such-option || echo still here")
     assert done.stdout == "still here\n"
