@@ -1,3 +1,5 @@
 """Terrain for powered-caster robots: the catalogue of grounds."""
 
-__all__: list[str] = []
+from .ground_catalogue import GROUNDS, Ground, contact_on, ground, robot_on
+
+__all__ = ["GROUNDS", "Ground", "contact_on", "ground", "robot_on"]
