@@ -1,8 +1,8 @@
 """Lambda and theta, (3.36)-(3.39), against two independent rigid-body engines, and the laws they must obey.
 
-The engines know nothing of casters: they get bodies, joints and rotors, and give the mass matrix M(q) and the bias h(q, q_dot)
-of the robot floating over the ground. Rolling without slip comes in afterwards, from the engine's own Jacobian of the rubber at
-the ground: q_dot = G(q) V. Then Lambda = G^T M G and theta = G^T (M G_dot V + h), with V in body axes.
+The engines know nothing of casters: they get bodies, joints and rotors, and give the mass matrix M(q) and the bias
+h(q, q_dot) of the robot floating over the ground. Rolling without slip comes in afterwards, from the engine's own Jacobian of
+the rubber at the ground: q_dot = G(q) V. Then Lambda = G^T M G and theta = G^T (M G_dot V + h), with V in body axes.
 """
 
 from __future__ import annotations
@@ -81,11 +81,12 @@ class MujocoEngine:
             tilt = 2.0 * bodies.fork_zz  # about horizontal axes: out of the plane, of no consequence
             casters.append(
                 f"""<body pos="{x:.17g} {y:.17g} 0"><joint name="{name}_steer" axis="0 0 1"/>
-                <inertial pos="{bodies.fork_com[0]:.17g} {bodies.fork_com[1]:.17g} {r:.17g}" mass="{bodies.fork_mass:.17g}"
-                  diaginertia="{tilt:.17g} {tilt:.17g} {bodies.fork_zz:.17g}"/>
+                <inertial pos="{bodies.fork_com[0]:.17g} {bodies.fork_com[1]:.17g} {r:.17g}"
+                  mass="{bodies.fork_mass:.17g}" diaginertia="{tilt:.17g} {tilt:.17g} {bodies.fork_zz:.17g}"/>
                 <body name="{name}_wheel" pos="{b_x:.17g} {b_y:.17g} {r:.17g}"><joint name="{name}_drive" axis="0 1 0"/>
                   <inertial pos="0 0 0" mass="{caster.wheel.mass:.17g}"
-                    diaginertia="{bodies.wheel_zz:.17g} {caster.wheel.inertia_axle:.17g} {bodies.wheel_zz:.17g}"/></body></body>"""
+                    diaginertia="{bodies.wheel_zz:.17g} {caster.wheel.inertia_axle:.17g} {bodies.wheel_zz:.17g}"/>
+                </body></body>"""
             )
             for motor, inertia, by_drive, by_steer in (
                 ("drive", caster.rotors.drive, caster.gears.drive, caster.gears.drive_per_steer),
@@ -93,7 +94,8 @@ class MujocoEngine:
             ):
                 motors.append(
                     f"""<fixed name="{name}_{motor}_motor" armature="{inertia:.17g}">
-                    <joint joint="{name}_drive" coef="{by_drive:.17g}"/><joint joint="{name}_steer" coef="{by_steer:.17g}"/></fixed>"""
+                    <joint joint="{name}_drive" coef="{by_drive:.17g}"/>
+                    <joint joint="{name}_steer" coef="{by_steer:.17g}"/></fixed>"""
                 )
         x, y, z = chassis.com
         xx, yy, zz = chassis.principal_inertias()
