@@ -117,6 +117,14 @@ def test_command_prints_the_table_of_the_readme(capsys: pytest.CaptureFixture[st
     assert re.findall(r"<!-- grounds: begin -->\n(.*?)\n<!-- grounds: end -->", readme, re.DOTALL) == [printed] == [table()]
 
 
+def test_example_of_the_readme_runs() -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    [example] = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    names: dict[str, object] = {}
+    exec(example, names)  # noqa: S102 - our own text
+    assert names["robot"] == robot_on(load_robot("tidybot2"), "wet_asphalt")
+
+
 def test_command_prints_a_section_that_a_robot_file_can_hold(capsys: pytest.CaptureFixture[str]) -> None:
     import yaml
 
