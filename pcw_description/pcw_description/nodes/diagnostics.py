@@ -1,0 +1,57 @@
+"""What a node says of itself on /diagnostics (REP-107)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """One statement: a level of REP-107, one line for people, and named numbers."""
+
+    level: bytes
+    message: str
+    values: Mapping[str, object] = dataclasses.field(default_factory=dict)
+
+
+class Diagnostics:
+    """Publishes a node's status regularly and on demand.
+
+    Args:
+        node: the node; its name and `aspect` name the status.
+        hardware_id: what the status is about, such as the robot's name.
+        status: asked for the status each time.
+        period: wall time between two reports [s]; wall time, because a status matters most when /clock has stopped.
+    """
+
+    def __init__(
+        self, node: Node, hardware_id: str, status: Callable[[], Status], aspect: str = "status", period: float = 1.0
+    ) -> None:
+        self._node, self._status = node, status
+        self._name, self._hardware_id = f"{node.get_name()}: {aspect}", hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        node.create_timer(period, self.report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def report(self) -> None:
+        """Publish the status now."""
+        status = self._status()
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            DiagnosticStatus(
+                level=status.level, name=self._name, message=status.message, hardware_id=self._hardware_id,
+                values=[KeyValue(key=key, value=_text(value)) for key, value in status.values.items()],
+            )
+        ]
+        self._publisher.publish(message)
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,100 @@
+"""Readings of the simulated robot as messages, on the topics of a real robot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, JointState
+
+from pcw_description.nodes.node_tools import SENSOR_SOURCE, fill_joint_state, ns_to_stamp
+from pcw_description.robot_description import LATERAL, LONGITUDINAL, RobotDescription
+
+from ..plants.plant import PlantState
+from ..sensors import ImuReading, JointReading
+from ..simulated_robot import Sample, TrackedPose
+
+
+class BridgePublishers:
+    """The bridge's publishers and their messages, made once and filled again and again."""
+
+    def __init__(self, node: Node, robot: RobotDescription) -> None:
+        self._clock = node.create_publisher(Clock, "/clock", 1)
+        self.joint_states = node.create_publisher(JointState, "joint_states", SENSOR_SOURCE)
+        self._truth = node.create_publisher(Odometry, "ground_truth/odom", SENSOR_SOURCE)
+        self._imu = node.create_publisher(Imu, "imu/data", SENSOR_SOURCE)
+        self._contacts = [
+            node.create_publisher(WrenchStamped, f"contact/{name}/wrench", SENSOR_SOURCE) for name in robot.caster_names
+        ]
+        self._joint_message = JointState(name=list(robot.joint_names))
+        self._imu_message = _imu_message(robot)
+        self._truth_message = _truth_message(robot)
+        self._contact_messages = [WrenchStamped() for _ in robot.caster_names]
+        for message, name in zip(self._contact_messages, robot.caster_names):
+            message.header.frame_id = f"{name}_fork"  # turns with the heading, as the wheel frame does
+
+    def publish(self, sample: Sample) -> None:
+        """Publish one reading; the joints are preceded by /clock, so that whoever answers knows the time."""
+        stamp, reading = ns_to_stamp(sample.time_ns), sample.reading
+        if isinstance(reading, JointReading):
+            self._clock.publish(Clock(clock=stamp))
+            self._joint_message.header.stamp = stamp
+            fill_joint_state(self._joint_message, reading.position, reading.velocity, reading.effort)
+            self.joint_states.publish(self._joint_message)
+        elif isinstance(reading, ImuReading):
+            message = self._imu_message
+            message.header.stamp = stamp
+            for vector, values in (
+                (message.angular_velocity, reading.angular_velocity),
+                (message.linear_acceleration, reading.linear_acceleration),
+            ):
+                vector.x, vector.y, vector.z = values.tolist()
+            self._imu.publish(message)
+        elif isinstance(reading, TrackedPose):
+            self._publish_truth(stamp, reading)
+        else:
+            self._publish_contacts(stamp, reading)
+
+    def _publish_truth(self, stamp, reading: TrackedPose) -> None:  # noqa: ANN001
+        message = self._truth_message
+        message.header.stamp = stamp
+        pose, twist = message.pose.pose, message.twist.twist
+        x, y, yaw = reading.pose.tolist()
+        pose.position.x, pose.position.y = x, y
+        pose.orientation.z, pose.orientation.w = math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+        twist.linear.x, twist.linear.y, twist.angular.z = reading.truth.twist.tolist()
+        self._truth.publish(message)
+
+    def _publish_contacts(self, stamp, truth: PlantState) -> None:  # noqa: ANN001
+        for i, (publisher, message) in enumerate(zip(self._contacts, self._contact_messages)):
+            message.header.stamp = stamp
+            force = message.wrench.force
+            force.x = float(truth.contact_force[i, LONGITUDINAL])
+            force.y = float(truth.contact_force[i, LATERAL])
+            force.z = float(truth.normal_force[i])
+            publisher.publish(message)
+
+
+def _imu_message(robot: RobotDescription) -> Imu:
+    message = Imu()
+    message.header.frame_id = "imu_link"
+    message.orientation_covariance[0] = -1.0  # sensor_msgs/Imu: no orientation in this message
+    if robot.sensors.imu is not None:
+        message.angular_velocity_covariance = (np.eye(3) * robot.sensors.imu.gyro_noise**2).ravel()
+        message.linear_acceleration_covariance = (np.eye(3) * robot.sensors.imu.accelerometer_noise**2).ravel()
+    return message
+
+
+def _truth_message(robot: RobotDescription) -> Odometry:
+    """Pose with the tracker's noise and its covariance; the twist is the simulator's truth, its covariance zero."""
+    message = Odometry(child_frame_id="base_link")
+    message.header.frame_id = "map"  # fixed to the world, where odom drifts (REP-105)
+    if robot.sensors.tracker is not None:
+        position, yaw = robot.sensors.tracker.position_noise**2, robot.sensors.tracker.yaw_noise**2
+        message.pose.covariance[0] = message.pose.covariance[7] = position
+        message.pose.covariance[35] = yaw
+    return message
