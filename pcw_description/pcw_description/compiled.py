@@ -1,12 +1,19 @@
 """The one way this project compiles inner loops: numba where it is installed, plain Python where it is not.
 
 Plain Python gives the same numbers, only slower, so a machine without numba still runs every node.
+
+Numba's cache knows the file of a kernel, not the files of the kernels it calls: after an edit of a friction curve, or an
+update of one package, a plant would go on with the old curve. So the cache also depends on every file that holds kernels.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 try:
@@ -30,14 +37,40 @@ def compiled(function: Function) -> Function:
     """Compile `function` to machine code, cached on disk; a division by zero gives inf or nan, as in numpy."""
     if not NUMBA_AVAILABLE:
         return function
-    return numba.njit(cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+    _depend_on_all_kernels(dispatcher)
+    return dispatcher  # type: ignore[no-any-return]
 
 
 def compiled_joint_torque(function: Function) -> Function:
     """Compile a joint-torque kernel with the common signature `JOINT_TORQUE_SIGNATURE`."""
     if not NUMBA_AVAILABLE:
         return function
-    return numba.njit(JOINT_TORQUE_SIGNATURE, cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    dispatcher: Any = compiled(function)
+    dispatcher.compile(JOINT_TORQUE_SIGNATURE)
+    dispatcher.disable_compile()
+    return dispatcher  # type: ignore[no-any-return]
+
+
+def _depend_on_all_kernels(dispatcher: Any) -> None:
+    """Add the kernels of its own package and of this one, those it can call, to what the cache of `dispatcher` depends on."""
+    package = sys.modules.get(dispatcher.py_func.__module__.partition(".")[0])
+    folders = {str(Path(__file__).parent), *getattr(package, "__path__", ())}
+    # No public name for this in numba; where it has gone, the cache is the usual one.
+    cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if hasattr(cache_file, "_source_stamp"):
+        cache_file._source_stamp = (cache_file._source_stamp, *(_kernels_digest(folder) for folder in sorted(folders)))
+
+
+@functools.cache
+def _kernels_digest(folder: str) -> str:
+    """Return a digest of all files below `folder` that hold kernels."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(folder).rglob("*.py")):
+        content = path.read_bytes()
+        if b"@compiled" in content:
+            digest.update(content)
+    return digest.hexdigest()
 
 
 def joint_torque_list(functions: Sequence[Callable[..., float]]) -> Any:
