@@ -22,11 +22,13 @@ PACKAGES = (
     "pcw_bringup_scripts",
 )
 
+# On import, not in a hook: pytest loads the conftest files of the folders on its command line before it calls one.
+FOUND_AT = {name: importlib.import_module(name).__file__ for name in PACKAGES}
+
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Import the packages and refuse to go on with one that comes from the source tree."""
-    for name in PACKAGES:
-        found_at = importlib.import_module(name).__file__
+    """Refuse to go on with a package that comes from the source tree."""
+    for name, found_at in FOUND_AT.items():
         source = config.rootpath / name / name
         if found_at is None or Path(found_at).parent == source:
             raise pytest.UsageError(
