@@ -41,8 +41,8 @@ KEY_OF_MODULE = {
     "yaml": "python3-yaml",
     "zstandard": "mcap-ros2-support",
 }
-# Needed without being imported by the Python package itself.
-NOT_IMPORTED = {"launch", "launch_ros", "ros2launch"}
+# Needed without being imported.
+NOT_IMPORTED = {"ros2launch"}
 
 
 def prefix_of(package: str) -> Path:
@@ -54,9 +54,9 @@ def prefix_of(package: str) -> Path:
 
 
 def imports_of(package: str) -> set[str]:
-    """Top-level modules that the package imports, standard library and itself left out."""
+    """Top-level modules that the package and its launch files import, standard library and itself left out."""
     modules = set()
-    for path in (REPOSITORY / package / package).rglob("*.py"):
+    for path in [*(REPOSITORY / package / package).rglob("*.py"), *(REPOSITORY / package).glob("launch/**/*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 modules.update(alias.name.partition(".")[0] for alias in node.names)
