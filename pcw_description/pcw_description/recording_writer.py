@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -146,12 +147,13 @@ class RecordingWriter:
         if topic not in self._topics:
             self.add_topic(topic, type_name)
         entry = self._topics[topic]
-        self._mcap.add_message(
-            channel_id=entry.channel_id,
-            log_time=log_time_ns,
-            data=cdr,
-            publish_time=log_time_ns if publish_time_ns is None else publish_time_ns,
-        )
+        with self._disk_errors_named():
+            self._mcap.add_message(
+                channel_id=entry.channel_id,
+                log_time=log_time_ns,
+                data=cdr,
+                publish_time=log_time_ns if publish_time_ns is None else publish_time_ns,
+            )
         entry.count += 1
         self._first_log_time = min(self._first_log_time, log_time_ns)
         self._last_log_time = max(self._last_log_time, log_time_ns)
@@ -169,7 +171,8 @@ class RecordingWriter:
     def flush(self) -> None:
         """Close the chunk in progress and hand it to the operating system, which keeps it after a kill."""
         if not self._closed:
-            self._mcap.flush()
+            with self._disk_errors_named():
+                self._mcap.flush()
         self._flushed_at = time.monotonic()
 
     # --- Closing ----------------------------------------------------------------------------------------
@@ -179,15 +182,25 @@ class RecordingWriter:
         if self._closed:
             return
         self._closed = True
+        # rosbag2 looks here for the version of the QoS text in the channels
+        information = yaml.safe_dump(self._information(), sort_keys=False)
+        with self._disk_errors_named():
+            try:
+                self._mcap.flush()
+                self._mcap.add_metadata("rosbag2", {"serialized_metadata": information})
+                self._mcap.finish()
+            finally:
+                self._file.close()
+            self._write_metadata_file()
+
+    @contextmanager
+    def _disk_errors_named(self) -> Iterator[None]:
         try:
-            self._mcap.flush()
-            # rosbag2 looks here for the version of the QoS text in the channels
-            information = yaml.safe_dump(self._information(), sort_keys=False)
-            self._mcap.add_metadata("rosbag2", {"serialized_metadata": information})
-            self._mcap.finish()
-        finally:
-            self._file.close()
-        self._write_metadata_file()
+            yield
+        except OSError as error:
+            raise RecordingError(
+                f"{self.path} cannot be written: {error.strerror}; what was flushed before can be read"
+            ) from error
 
     def __enter__(self) -> RecordingWriter:
         """Return the writer, which `__exit__` closes."""

@@ -94,7 +94,7 @@ def drive(robot: RobotDescription, seed: int = 0) -> Drive:
     return _drive(robot.name, seed).copy()
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _drive(name: str, seed: int) -> Drive:
     robot, seconds = load_robot(name), 12.0
     rng = np.random.default_rng(seed)

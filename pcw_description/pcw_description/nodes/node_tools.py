@@ -59,8 +59,8 @@ def run_node(factory: Callable[[], Node], args: Sequence[str] | None = None) -> 
     """Make the node, spin it until a signal or a shutdown, close and destroy it. Returns the exit code.
 
     0 after SIGINT, SIGTERM or a shutdown from outside; 2 with one line on stderr for bad input (`PcwError`, a
-    refused parameter); 1 with a traceback for anything else. A node's `close()` runs first of all, while it
-    can still publish, also after an exception.
+    refused parameter); 1 with a traceback for anything else. A node that has an end of its own sets `finished`.
+    A node's `close()` runs first of all, while it can still publish, also after an exception.
     """
     return run_nodes([factory], args)
 
@@ -103,16 +103,21 @@ def spin_until_shutdown(*nodes: Node) -> None:
         _spin(nodes, stop_requests)
 
 
-def _spin(nodes: Iterable[Node], stop_requests: list[float]) -> None:
+def _spin(nodes: Sequence[Node], stop_requests: list[float]) -> None:
     executor = make_executor()
     try:
         for node in nodes:
             executor.add_node(node)
         # EventsExecutor.spin() of Jazzy may spin without calling anything; spin_once() is sound.
-        while rclpy.ok() and not stop_requests:
+        while rclpy.ok() and not stop_requests and not _all_finished(nodes):
             executor.spin_once(timeout_sec=SPIN_TIMEOUT)
     finally:
         executor.shutdown()
+
+
+def _all_finished(nodes: Sequence[Node]) -> bool:
+    """Whether every node says that it has nothing left to do, by an attribute `finished`."""
+    return all(getattr(node, "finished", False) for node in nodes)
 
 
 def make_executor() -> Executor:
@@ -148,6 +153,9 @@ def _close(node: Node) -> int:
         return 0
     try:
         close()
+    except PcwError as error:
+        print(f"{_program_name()}: {error}", file=sys.stderr)
+        return 2
     except Exception:
         traceback.print_exc()
         return 1
