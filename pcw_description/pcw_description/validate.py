@@ -11,7 +11,9 @@ from .effects.registry import all_effects
 from .errors import PcwError
 from .robot_description import DEFAULT_TOLERANCES, RobotDescription, load_robot, shipped_robots
 
-CASTER_DEFAULTS = ("caster_defaults", "", "optional", "what all casters share, with the keys of a caster; each caster overrides it")
+CASTER_DEFAULTS = (
+    "caster_defaults", "", "optional", "what all casters share, with the keys of a caster; each caster overrides it",
+)
 
 
 def keys_table() -> str:
