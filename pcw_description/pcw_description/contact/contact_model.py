@@ -78,8 +78,9 @@ def friction_coefficient(tyre, longitudinal_slip, lateral_slip):  # type: ignore
     if s < 1e-12:
         return 0.0, 0.0
     along = _curve(model, s * tyre[LAMBDA], tyre[MU], tyre[LAMBDA], tyre[A], tyre[B], tyre[C])
+    lateral_mu, lateral_lambda = tyre[LATERAL_MU], tyre[LATERAL_LAMBDA]
     across = _curve(
-        model, s * tyre[LATERAL_LAMBDA], tyre[LATERAL_MU], tyre[LATERAL_LAMBDA], tyre[LATERAL_A], tyre[LATERAL_B], tyre[LATERAL_C]
+        model, s * lateral_lambda, lateral_mu, lateral_lambda, tyre[LATERAL_A], tyre[LATERAL_B], tyre[LATERAL_C]
     )
     return along * sx / s, across * sy / s
 
@@ -100,14 +101,14 @@ def tyre_step(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type:
         New z_x, z_y [m] and the force of the ground on the wheel F_x, F_y in the wheel frame [N].
     """
     length = tyre[LENGTH]
-    loss = speed / length
+    loss_x = loss_y = speed / length
     if int(tyre[MODEL]) == _LUGRE:
         slip_speed = math.sqrt(slip_x * slip_x + slip_y * slip_y)
-        stiffness = tyre[A] / length
-        sliding = lugre.sliding_friction(slip_speed, tyre[MU], tyre[B], tyre[C])
-        loss += stiffness * slip_speed / sliding
-    new_x = (z_x + dt * slip_x) / (1.0 + dt * loss)
-    new_y = (z_y + dt * slip_y) / (1.0 + dt * loss)
+        loss_x += tyre[A] / length * slip_speed / lugre.sliding_friction(slip_speed, tyre[MU], tyre[B], tyre[C])
+        sliding_y = lugre.sliding_friction(slip_speed, tyre[LATERAL_MU], tyre[LATERAL_B], tyre[LATERAL_C])
+        loss_y += tyre[LATERAL_A] / length * slip_speed / sliding_y
+    new_x = (z_x + dt * slip_x) / (1.0 + dt * loss_x)
+    new_y = (z_y + dt * slip_y) / (1.0 + dt * loss_y)
     damping = DAMPING_TIME / dt
     lambda_x = (new_x + damping * (new_x - z_x)) / length
     lambda_y = (new_y + damping * (new_y - z_y)) / length

@@ -20,14 +20,16 @@ def shape_numbers(mu_p: float, lambda_p: float, shape: Mapping[str, float]) -> t
     """Return (B, C, E) with B such that the peak lies at lambda_p.
 
     Raises:
-        DescriptionError: unknown name, C outside (1, 3) or E at 1 or above, where the curve has no peak.
+        DescriptionError: unknown name, C outside (1, 2] or E at 1 or above, where the curve has no peak or ends below zero.
     """
     for name in shape:
         if name not in SHAPE_NAMES:
             raise DescriptionError(f"contact.shape.{name}", shape[name], f"unknown key; {nearest_name(name, SHAPE_NAMES)}")
     c, e = float(shape.get("C", 1.65)), float(shape.get("E", 0.0))
-    if not 1.0 < c < 3.0:
-        raise DescriptionError("contact.shape.C", c, "allowed: above 1 and below 3, where the curve has a peak")
+    if not 1.0 < c <= 2.0:
+        raise DescriptionError(
+            "contact.shape.C", c, "allowed: above 1, where the curve has a peak, and at most 2, where it ends at zero"
+        )
     if not -20.0 <= e < 1.0:
         raise DescriptionError("contact.shape.E", e, "allowed: -20 to below 1, where the curve has a peak")
     target = math.tan(math.pi / (2.0 * c))
