@@ -1,0 +1,432 @@
+"""The channel of a bench axis: `axis_force`, the force that the nominal model does not account for.
+
+    residual = H[force + external_force] - (inertia H[a] - gravity - known effects),      H the same filter everywhere
+
+with the position filtered before it is differentiated. Candidates are all joint-torque effects of the vocabulary that
+a drive without ground contact can have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from pcw_description.axis_recording import TARGET, AxisDescription, AxisRecording
+from pcw_description.effects.effect import Effect, EffectParameter, JointTorqueEffect
+from pcw_description.effects.registry import all_effects
+
+from .errors import MismatchError
+from .regression_problem import (
+    BoolArray,
+    Channel,
+    FloatArray,
+    LinearParameter,
+    Nuisance,
+    RegressionProblem,
+    Shape,
+    Term,
+)
+from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
+
+LARGEST_CUTOFF = (
+    40.0  # [Hz]; above it real drives show the resonances of their structure, which no effect here describes
+)
+SMALLEST_CUTOFF = 2.0
+# Derivatives are formed of signals filtered this much wider than the channel, so that kernels see sharp reversals.
+PREFILTER_RATIO = 2.5
+# The noise that differentiation puts into the inertial force may reach this part of the measured force.
+ALLOWED_DERIVATIVE_NOISE = 0.05
+SHORTEST_SEGMENT = 1.0  # [s]
+LARGEST_ORDER_GRID = 1500
+# Parameters that only smooth a sign: one value serves all effects of an axis, chosen once.
+SMOOTHING = "smoothing_speed"
+
+
+@dataclasses.dataclass(frozen=True)
+class AxisMotion:
+    """One contiguous piece at the recording's own rate, after the wide filter; arrays (T,)."""
+
+    recording: int
+    time: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    force: FloatArray
+    still: FloatArray
+
+
+def choose_cutoff(axis: AxisDescription, recordings: Sequence[AxisRecording]) -> float:
+    """Return the largest cut-off at which differentiated position noise stays small against the force [Hz].
+
+    White position noise s_q at rate f_s, differentiated twice and cut at f_c, has the variance
+    2 s_q^2 (2 pi)^4 f_c^5 / (5 f_s).
+    """
+    cutoffs = []
+    for recording in recordings:
+        rate = 1.0 / float(np.median(np.diff(recording.time)))
+        limit = min(LARGEST_CUTOFF, rate / 6.0)
+        noise = white_noise_level(recording.position) if recording.velocity is None else 0.0
+        allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(recording.force)), 1e-300) / axis.inertia
+        if noise > 0.0:
+            limit = min(limit, (allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)
+        cutoffs.append(limit)
+    return max(min(cutoffs), SMALLEST_CUTOFF)
+
+
+def axis_motion(
+    axis: AxisDescription, recording: AxisRecording, index: int, cutoff: float
+) -> tuple[float, list[AxisMotion]]:
+    """Filter one recording and differentiate it.
+
+    Returns:
+        The sampling rate [Hz] and the usable pieces.
+    """
+    velocity = recording.velocity if recording.velocity is not None else np.full_like(recording.time, np.nan)
+    signals = np.stack([recording.position, velocity, recording.force + recording.external_force], axis=1)
+    rate, pieces = uniform_segments(recording.time, signals, largest_gap=0.02)
+    wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
+    noise = white_noise_level(recording.position)
+    # Deviation of the velocity of a noisy position after the wide filter.
+    creep = noise * np.sqrt(2.0 / rate * (2.0 * np.pi) ** 2 * min(wide.cutoff, 0.5 * rate) ** 3 / 3.0)
+    motions = []
+    for stamps, values in pieces:
+        if stamps[-1] - stamps[0] < SHORTEST_SEGMENT:
+            continue
+        position, force = wide.smooth(values[:, 0]), wide.smooth(values[:, 2])
+        if recording.velocity is None:
+            speed = derivative(position, rate)
+        else:
+            speed = wide.smooth(values[:, 1])
+        floor = max(4.0 * creep, 2e-3 * float(np.max(np.abs(speed))))
+        motions.append(
+            AxisMotion(
+                recording=index,
+                time=stamps,
+                position=position,
+                velocity=speed,
+                acceleration=derivative(speed, rate),
+                force=force,
+                still=_long_runs(np.abs(speed) < floor, int(0.05 * rate)),
+            )
+        )
+    return rate, motions
+
+
+def _long_runs(flags: BoolArray, shortest: int) -> FloatArray:
+    """Return 1.0 where `flags` has been true for at least `shortest` samples on end, else 0.0."""
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
+    result = np.zeros(len(flags))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - start >= shortest:
+            result[start:stop] = 1.0
+    return result
+
+
+class AxisProblemBuilder:
+    """Builds the regression problem of a bench axis from its recordings."""
+
+    def __init__(
+        self, axis: AxisDescription, recordings: Sequence[AxisRecording], cutoff: float | None = None
+    ) -> None:
+        """Filter the recordings.
+
+        Args:
+            cutoff: of the channel filter [Hz]; None chooses it from the noise of the recordings.
+
+        Raises:
+            MismatchError: no recording has a piece long enough.
+        """
+        self.axis = axis
+        self.cutoff = cutoff if cutoff is not None else choose_cutoff(axis, recordings)
+        rates_and_motions = [
+            axis_motion(axis, recording, i, self.cutoff) for i, recording in enumerate(recordings)
+        ]
+        slowest = min(rate for rate, _ in rates_and_motions)
+        self.filters = [SignalFilter(rate, self.cutoff) for rate, _ in rates_and_motions]
+        self.motions = [motion for _, motions in rates_and_motions for motion in motions]
+        if not self.motions:
+            raise MismatchError(f"no contiguous piece of at least {SHORTEST_SEGMENT:g} s in the recordings")
+        self.rate = slowest / SignalFilter(slowest, self.cutoff).step
+        self._force = self._filtered([motion.force for motion in self.motions])
+        self._variables = {
+            "position": self._filtered([m.position for m in self.motions]),
+            "velocity": self._filtered([m.velocity for m in self.motions]),
+            "acceleration": self._filtered([m.acceleration for m in self.motions]),
+        }
+        self._acceleration = self._variables["acceleration"]
+        self._valid = self._filtered([m.still for m in self.motions]) < 0.1
+        self._smooth_forces = self._explained_force()
+
+    def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
+        """Channel filter on full-rate arrays of all motions, joined: [(T_i, ...)] -> (T, ...)."""
+        return np.concatenate(
+            [self.filters[m.recording].apply(p) for m, p in zip(self.motions, pieces, strict=True)]
+        )
+
+    def _explained_force(self) -> list[FloatArray]:
+        """The force as the simplest models of a drive would have it, at full rate.
+
+        Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
+        and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
+        do not have: an error of the torque constant scales what is explained, it explains nothing by itself.
+        """
+        speed = np.concatenate([m.velocity for m in self.motions])
+        top = max(float(np.quantile(np.abs(speed), 0.99)), 1e-12)
+
+        def basis(m: AxisMotion) -> FloatArray:
+            sign = np.tanh(m.velocity / (0.02 * top))
+            a, v = m.acceleration, m.velocity
+            jerk = derivative(a, self.filters[m.recording].rate)  # what a skew of the clocks adds
+            return np.stack([a, v, sign, np.ones_like(sign), np.abs(a) * sign, jerk], axis=1)
+
+        stacked = np.concatenate([basis(m) for m in self.motions])
+        force = np.concatenate([m.force for m in self.motions])
+        size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
+        solution, *_ = np.linalg.lstsq(stacked / size, force, rcond=1e-8)
+        scaled = solution / size
+        return [basis(m) @ scaled for m in self.motions]
+
+    def choose_smoothing(self, others: Sequence[tuple[str, Shape]] = ()) -> float:
+        """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares.
+
+        Args:
+            others: further effects with their shapes that the fit shall hold beside the frictions of the vocabulary,
+                so that a cogging, say, does not choose the smoothing.
+        """
+        frictions = [
+            e for e in candidate_effects() if e.parameters and SMOOTHING in {p.name for p in e.parameters}
+        ]
+        companions = [("drive_viscous_friction", {}), ("constant_load", {}), *others]
+        fixed = [self._acceleration[:, None]]
+        fixed += [self._columns(all_effects()[name], shape)[:, 0, :] for name, shape in companions]  # type: ignore[arg-type]
+        valid = self._valid
+        top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.98)), 1e-12)
+
+        def misfit(smoothing: float) -> float:
+            columns = list(fixed)
+            for effect in frictions:
+                shapes = [p for p in effect.nonlinear_parameters if p.name != SMOOTHING]
+                shape = {SMOOTHING: smoothing} | {p.name: 0.1 * top for p in shapes}
+                columns.append(self._columns(effect, shape)[:, 0, :])
+            stacked = np.concatenate(columns, axis=1)[valid]
+            size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
+            solution, *_ = np.linalg.lstsq(stacked / size, self._force[valid], rcond=1e-8)
+            return float(np.sum((self._force[valid] - stacked / size @ solution) ** 2))
+
+        grid = top * np.geomspace(5e-4, 0.2, 9)
+        best = grid[int(np.argmin([misfit(float(value)) for value in grid]))]
+        for width in (0.5, 0.2):
+            nearby = best * np.exp(width * np.array([-1.0, 0.0, 1.0]))
+            best = nearby[int(np.argmin([misfit(float(value)) for value in nearby]))]
+        return float(best)
+
+    def build(self, smoothing: float) -> RegressionProblem:
+        """Return the problem with the given smoothing of all signs."""
+        axis = self.axis
+        acceleration = self._variables["acceleration"]
+        predicted = axis.inertia * acceleration
+        nuisances = [
+            Nuisance(
+                "inertia",
+                axis.unit("kg m^2"),
+                axis.inertia,
+                _deviation(axis, "inertia", axis.inertia),
+                acceleration[:, None],
+            )
+        ]
+        if axis.gravity_arm is not None:
+            arm = axis.gravity_arm
+            shape = self._filtered([np.sin(m.position - arm.hanging_position) for m in self.motions])
+            predicted = predicted + arm.moment * shape
+            deviation = _deviation(axis, "gravity_moment", arm.moment)
+            nuisances.append(Nuisance("gravity_moment", "N m", arm.moment, deviation, shape[:, None]))
+        # Force measured later than it acts: F(t - d) = F(t) - d F'(t), with the derivative of the explained force.
+        skew = self._filtered(
+            [
+                -derivative(f, self.filters[m.recording].rate)
+                for m, f in zip(self.motions, self._smooth_forces, strict=True)
+            ]
+        )
+        period = 1.0 / max(f.rate for f in self.filters)
+        nuisances.append(
+            Nuisance("clock_offset", "s", 0.0, _deviation(axis, "clock_offset", 1.0) * period, skew[:, None])
+        )
+        for instance in axis.physics:
+            effect = all_effects()[instance.name]
+            if isinstance(effect, JointTorqueEffect):
+                predicted = predicted - self._filtered(self._contributions(effect, instance.parameters))
+        measured = self._force
+        stamps = [self.filters[m.recording].decimate(m.time) for m in self.motions]
+        start = {m.recording: m.time[0] for m in reversed(self.motions)}
+        time = np.concatenate([t - start[m.recording] for m, t in zip(self.motions, stamps, strict=True)])
+        segment = np.concatenate([np.full(len(t), i) for i, t in enumerate(stamps)])
+        recording = np.concatenate(
+            [np.full(len(t), m.recording) for m, t in zip(self.motions, stamps, strict=True)]
+        )
+        variables = dict(self._variables)
+        variables["time"] = time
+        variables["force"] = self._filtered(self._smooth_forces)
+        terms = [self._term(effect, smoothing) for effect in candidate_effects()]
+        return RegressionProblem(
+            channels=(Channel("axis_force", axis.unit("N m"), axis="drive"),),
+            time=time,
+            segment=segment,
+            recording=recording,
+            rate=self.rate,
+            measured=measured[:, None],
+            residual=(measured - predicted)[:, None],
+            valid=self._valid[:, None],
+            nuisances=tuple(nuisances),
+            terms=tuple(terms),
+            variables=variables,
+        )
+
+    def _contributions(
+        self, effect: JointTorqueEffect, parameters: dict[str, float] | Shape
+    ) -> list[FloatArray]:
+        zero = [np.zeros_like(m.position) for m in self.motions]
+        return [
+            effect.contribution(m.position, m.velocity, f, z, parameters)
+            for m, f, z in zip(self.motions, self._smooth_forces, zero, strict=True)
+        ]
+
+    def _columns(self, effect: JointTorqueEffect, shape: Shape) -> FloatArray:
+        """Exact columns (T, 1, P): what one unit of each linear parameter adds to the force the motor must give."""
+        per_motion = []
+        for m, force in zip(self.motions, self._smooth_forces, strict=True):
+            by_name = effect.regressor(m.position, m.velocity, force, np.zeros_like(force), shape)
+            per_motion.append(-np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1))
+        return self._filtered(per_motion)[:, None, :]
+
+    def _term(self, effect: JointTorqueEffect, smoothing: float) -> Term:
+        fixed = {p.name: smoothing for p in effect.nonlinear_parameters if p.name == SMOOTHING}
+        shapes: list[dict[str, float]] = [dict(fixed)]
+        resolution: dict[str, tuple[str, float]] = {}
+        periodic = None
+        for parameter in effect.nonlinear_parameters:
+            if parameter.name == SMOOTHING:
+                continue
+            grid, kind, step = self._shape_grid(parameter)
+            resolution[parameter.name] = (kind, step)
+            shapes = [{**shape, parameter.name: float(value)} for shape in shapes for value in grid]
+            if kind == "linear":
+                periodic = parameter.name
+
+        def columns(shape: Shape) -> FloatArray:
+            return self._columns(effect, shape)
+
+        deviations = self._deviations(effect, shapes[len(shapes) // 2])
+        parameters = tuple(
+            LinearParameter(
+                p.name, self.axis.unit(p.unit), p.lower, p.upper, deviation, refinement=p.name == "asymmetry"
+            )
+            for p, deviation in zip(effect.linear_parameters, deviations, strict=True)
+        )
+        return Term(
+            effect=effect.name,
+            target=(TARGET,),
+            parameters=parameters,
+            shapes=tuple(shapes),
+            columns=columns,
+            arguments=kernel_arguments(effect.name),
+            repeatable=periodic is not None,
+            resolution=resolution,
+            scan=(lambda: self._periodic_scan(effect, shapes, periodic)) if periodic is not None else None,
+        )
+
+    def _deviations(self, effect: JointTorqueEffect, shape: Shape) -> list[float]:
+        """Prior deviation per parameter: a contribution as large as the whole measured force."""
+        columns = self._columns(effect, shape)[:, 0, :]
+        size = float(np.sqrt(np.mean(self._force**2)))
+        return [
+            size / max(float(np.sqrt(np.mean(columns[:, k] ** 2))), 1e-300) for k in range(columns.shape[1])
+        ]
+
+    def _shape_grid(self, parameter: EffectParameter) -> tuple[FloatArray, str, float]:
+        """Return the grid, its kind and its spacing (a ratio for a logarithmic one) of a shaping parameter."""
+        speed = np.abs(self._variables["velocity"])
+        top = max(float(np.quantile(speed, 0.98)), 1e-12)
+        if parameter.unit == "rad/s":
+            grid = np.geomspace(0.02, 0.6, 8) * top
+            return grid, "log", float(grid[1] / grid[0])
+        if parameter.unit == "1/rad":
+            position = self._variables["position"]
+            travel = max(float(np.ptp(position)), 1e-12)
+            step = np.pi / travel  # half a period over the travel
+            typical = max(
+                float(np.median(speed[speed > 0.05 * top])) if np.any(speed > 0.05 * top) else top, 1e-12
+            )
+            highest = 2.0 * np.pi * self.cutoff / typical
+            grid = np.arange(3.0 * np.pi / travel, max(highest, 6.0 * np.pi / travel), step)
+            if len(grid) > LARGEST_ORDER_GRID and self.axis.kind == "rotary":
+                grid = np.arange(1.0, min(highest, LARGEST_ORDER_GRID))
+            return grid[:LARGEST_ORDER_GRID], "linear", step
+        if parameter.lower > 0.0:
+            grid = np.geomspace(parameter.lower, parameter.upper, 12)
+            return grid, "log", float(grid[1] / grid[0])
+        grid = np.linspace(parameter.lower, parameter.upper, 12)
+        return grid, "linear", float(grid[1] - grid[0])
+
+    def _periodic_scan(self, effect: JointTorqueEffect, shapes: Sequence[Shape], name: str) -> FloatArray:
+        """Columns of all shapes of an effect periodic in position, (T, 1, shapes, P), evaluated at the channel's rate.
+
+        The filter's attenuation at the local frequency k v / 2 pi stands for filtering at the full rate, which for a
+        thousand orders would take a minute.
+        """
+        position, velocity = self._variables["position"], self._variables["velocity"]
+        force, zero = self._variables_force(), np.zeros_like(position)
+        width = len(effect.linear_parameters)
+        scanned: FloatArray = np.empty((len(position), 1, len(shapes), width))
+        for index, shape in enumerate(shapes):
+            by_name = effect.regressor(position, velocity, force, zero, shape)
+            attenuation = self.filters[0].gain(shape[name] * velocity / (2.0 * np.pi))
+            for column, parameter in enumerate(effect.linear_parameters):
+                scanned[:, 0, index, column] = -by_name[parameter.name] * attenuation
+        return scanned
+
+    def _variables_force(self) -> FloatArray:
+        return self._filtered(self._smooth_forces)
+
+
+def _deviation(axis: AxisDescription, name: str, nominal: float) -> float:
+    tolerance = axis.tolerance(name)
+    return tolerance.value * abs(nominal) if tolerance.relative else tolerance.value
+
+
+@functools.cache
+def kernel_arguments(name: str) -> tuple[str, ...]:
+    """Return which of position, velocity, force and normal_force the kernel of an effect depends on, by trying."""
+    effect = all_effects()[name]
+    assert isinstance(effect, JointTorqueEffect)
+    rng = np.random.default_rng(0)
+    unit = {
+        p.name: (1.0 if p.linear else (p.default if p.default is not None else p.typical))
+        for p in effect.parameters
+    }
+    arrays = [rng.uniform(0.3, 2.0, 16) * rng.choice([-1.0, 1.0], 16) for _ in range(4)]
+    before = effect.contribution(arrays[0], arrays[1], arrays[2], arrays[3], unit)
+    found = []
+    for index, name in enumerate(("position", "velocity", "force", "normal_force")):
+        changed = list(arrays)
+        changed[index] = np.roll(arrays[index], 1) * 1.37
+        after = effect.contribution(changed[0], changed[1], changed[2], changed[3], unit)
+        if not np.array_equal(before, after):
+            found.append(name)
+    return tuple(found)
+
+
+@functools.cache
+def candidate_effects() -> tuple[JointTorqueEffect, ...]:
+    """Return the effects of the vocabulary that a bench axis can have: drive torques that need no load on a wheel."""
+
+    def suits(effect: Effect) -> bool:
+        return (
+            isinstance(effect, JointTorqueEffect)
+            and effect.axis == "drive"
+            and "normal_force" not in kernel_arguments(effect.name)
+        )
+
+    return tuple(effect for effect in all_effects().values() if suits(effect))  # type: ignore[misc]

@@ -1,0 +1,442 @@
+"""Chooses the set of effects that explains a recording: by evidence of sets, calibrated on surrogates, checked held out.
+
+1. Grow: add the term of largest marginal gain, refit everything jointly, re-estimate the noise; go on with a lenient
+   threshold, so that what is left at the end is noise even where the surplus terms will not stay.
+2. Calibrate: phase-randomised surrogates of that noise are searched like the recording. The largest gain that noise
+   alone reaches, at the wanted false-alarm rate, is the threshold.
+3. Prune: drop every term whose loss in evidence stays below the threshold, that does not lower the error on held-out
+   blocks, or that moves no channel by a fair part of what is left of it. Exchange terms where another one does better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .noise_model import SLOW_ORDINATES, fit_noise_model, huber_weights, robust_deviation, white_noise_model
+from .regression_problem import FloatArray, IntArray, RegressionProblem, contiguous_blocks, segment_slices
+from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression
+
+Progress = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class SelectionSettings:
+    """What the user may turn.
+
+    Attributes:
+        false_alarm_rate: share of recordings with nothing missing in which something may be named.
+        lenient_gain: nats to enter the first, over-complete model.
+        smallest_threshold: nats below which nothing is named however quiet the surrogates are (odds of 150 to 1).
+        smallest_share: a term must move some channel by at least this part of the rms that remains there. Below it lie
+            the details that no model of a real machine gets right, and they repeat as faithfully as an effect does.
+        smallest_part: a term must also move some channel by this part of what all effects together do: the shape of a
+            large effect is itself only known so well, and its error must not be named a further effect.
+        blocks: of the cross-validation.
+        first_repeats: instances of a repeatable term in the first over-complete set; more would eat red noise line by line.
+    """
+
+    false_alarm_rate: float = 0.005
+    lenient_gain: float = 2.0
+    smallest_threshold: float = 5.0
+    smallest_share: float = 0.25
+    smallest_part: float = 0.02
+    blocks: int = 10
+    surrogates: int = 200
+    largest_set: int = 16
+    first_repeats: int = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class LadderStep:
+    """One line of the report's ladder: what was tried, what it gained, what became of it."""
+
+    description: str
+    gain: float
+    held_out_gain: float | None
+    outcome: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Selection:
+    """The chosen set with everything needed to say why.
+
+    Attributes:
+        regression: whitened at the chosen set.
+        threshold: nats, from the surrogates.
+        losses: evidence lost when the instance is dropped and the rest refitted, per instance.
+        held_out: reduction of the squared whitened error on held-out blocks (half of it: nats), per instance.
+    """
+
+    regression: WhitenedRegression
+    fit: Fit
+    threshold: float
+    losses: tuple[float, ...]
+    held_out: tuple[float, ...]
+    ladder: tuple[LadderStep, ...]
+
+
+class EffectSearch:
+    """The search on one problem. Holds the current noise model; everything random comes from `rng`."""
+
+    def __init__(
+        self,
+        problem: RegressionProblem,
+        rng: np.random.Generator,
+        settings: SelectionSettings | None = None,
+        progress: Progress = lambda message: None,
+    ) -> None:
+        self.problem = problem
+        self.rng = rng
+        self.settings = settings or SelectionSettings()
+        self.progress = progress
+        self.block: IntArray = contiguous_blocks(problem.segment, self.settings.blocks)
+        self.ladder: list[LadderStep] = []
+
+    def run(self) -> Selection:
+        """Grow, calibrate, prune."""
+        instances = self.over_complete()
+        regression = self.whiten_at(self.residual_of(instances))
+        for _ in range(3):
+            before = instances
+            instances = self.grow(regression, self.thin(regression, instances))
+            regression = self.whiten_at(self.residual_of(instances))
+            if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
+                break
+        threshold = self.calibrate(regression, instances)
+        return self.prune(regression, instances, threshold)
+
+    def whiten_at(self, residual: FloatArray, white: bool = False) -> WhitenedRegression:
+        """Whiten the problem by the noise of a residual (T, C)."""
+        problem = self.problem
+        if white:
+            noise = white_noise_model(residual, problem.valid)
+        else:
+            noise = fit_noise_model(residual, problem.valid, problem.segment)
+        weights = np.ones_like(residual)
+        for channel in range(residual.shape[1]):
+            values = residual[:, channel]
+            weights[:, channel] = huber_weights(values / robust_deviation(values[problem.valid[:, channel]]))
+        return WhitenedRegression(problem, noise, weights, self.block)
+
+    def residual_of(self, instances: Sequence[Instance]) -> FloatArray:
+        """Residual (T, C) of the least-squares fit of a set, with robust weights."""
+        residual = self.problem.residual
+        for _ in range(3):
+            regression = self.whiten_at(residual, white=True)
+            residual = regression.unwhitened_residual(regression.fit(instances))
+        return residual
+
+    # -- 1 grow -------------------------------------------------------------------------------------------------
+
+    def over_complete(self) -> tuple[Instance, ...]:
+        """A set that explains more than there is, by plain least squares: what it leaves is the first idea of the noise.
+
+        Every residual that still holds a large effect looks like strong slow noise, under which nothing could be found.
+        """
+        instances: tuple[Instance, ...] = ()
+        regression = self.whiten_at(self.problem.residual, white=True)
+        while len(instances) < self.settings.largest_set:
+            step = self.best_addition(regression, instances)
+            if step is None or step.gain < self.settings.lenient_gain:
+                break
+            if sum(i.term == step.instance.term for i in instances) >= self.settings.first_repeats:
+                break
+            instances = (*instances, self.refine_shape(regression, instances, step.instance))
+            instances = self.improve(regression, instances)
+            regression = self.whiten_at(self.residual_of(instances), white=True)
+        return instances
+
+    def thin(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
+        """Drop terms as long as that costs less than the lenient gain."""
+        while instances:
+            fit = regression.fit(instances)
+            losses = [
+                fit.log_evidence - regression.fit(instances[:i] + instances[i + 1 :]).log_evidence
+                for i in range(len(instances))
+            ]
+            index = int(np.argmin(losses))
+            if losses[index] >= self.settings.lenient_gain and regression.within_bounds(fit):
+                break
+            instances = instances[:index] + instances[index + 1 :]
+        return instances
+
+    def grow(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
+        """Forward selection with a lenient threshold, exchanging terms where that helps."""
+        instances = self.improve(regression, instances)
+        while len(instances) < self.settings.largest_set:
+            step = self.best_addition(regression, instances)
+            if step is None or step.gain < self.settings.lenient_gain:
+                break
+            instances = (*instances, self.refine_shape(regression, instances, step.instance))
+            self.progress(f"+ {self.label(instances[-1])}: gain {step.gain:.1f} nats")
+            self.ladder.append(LadderStep(f"add {self.label(instances[-1])}", step.gain, None, "tried"))
+            instances = self.improve(regression, instances)
+        return instances
+
+    def best_addition(
+        self, regression: WhitenedRegression, instances: Sequence[Instance]
+    ) -> Candidate | None:
+        """The candidate of largest gain with which every parameter of the joint fit stays within its bounds."""
+        best: Candidate | None = None
+        for candidate in regression.scan(instances)[0][:12]:
+            if not math.isfinite(candidate.gain) or (best is not None and candidate.gain < best.gain):
+                break
+            if self.repeats(candidate.instance, instances):
+                continue
+            if regression.within_bounds(regression.fit([*instances, candidate.instance])):
+                best = candidate
+        return best
+
+    def repeats(self, candidate: Instance, instances: Sequence[Instance]) -> bool:
+        """Whether a repeatable term is already there with practically the same shape."""
+        term = self.problem.terms[candidate.term]
+        for instance in instances:
+            if instance.term != candidate.term:
+                continue
+            if not term.repeatable:
+                return True
+            mine, theirs = dict(candidate.shape), dict(instance.shape)
+            if all(
+                abs(mine[name] - theirs[name]) < step
+                for name, (kind, step) in term.resolution.items()
+                if kind == "linear"
+            ):
+                return True
+        return False
+
+    def refine_shape(
+        self, regression: WhitenedRegression, others: Sequence[Instance], instance: Instance
+    ) -> Instance:
+        """Local search of the shaping parameters between the neighbours on the grid, one after the other."""
+        term = self.problem.terms[instance.term]
+        for name, (kind, spacing) in term.resolution.items():
+            width = math.log(spacing) if kind == "log" else spacing
+            for _ in range(2):
+                best, best_evidence = instance, -math.inf
+                for offset in np.linspace(-1.0, 1.0, 7):
+                    shape = dict(instance.shape)
+                    shape[name] = (
+                        shape[name] * math.exp(offset * width)
+                        if kind == "log"
+                        else shape[name] + offset * width
+                    )
+                    if shape[name] <= 0.0:
+                        continue
+                    trial = regression.with_shape(instance, shape)
+                    evidence = regression.fit([*others, trial]).log_evidence
+                    if evidence > best_evidence:
+                        best, best_evidence = trial, evidence
+                instance = best
+                width *= 0.4
+        return instance
+
+    def improve(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...]
+    ) -> tuple[Instance, ...]:
+        """Exchange a term for another one, or drop it, wherever the evidence of the whole set rises."""
+        for _ in range(2 * self.settings.largest_set):
+            fit = regression.fit(instances)
+            change = self.best_exchange(regression, instances, fit)
+            if change is None:
+                break
+            description, instances = change
+            self.progress(description)
+            self.ladder.append(
+                LadderStep(
+                    description, regression.fit(instances).log_evidence - fit.log_evidence, None, "done"
+                )
+            )
+        return instances
+
+    def best_exchange(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
+    ) -> tuple[str, tuple[Instance, ...]] | None:
+        """The first single exchange or removal that raises the evidence by more than half a nat, if any."""
+        for index, instance in enumerate(instances):
+            others = instances[:index] + instances[index + 1 :]
+            without = regression.fit(others)
+            if without.log_evidence > fit.log_evidence and regression.within_bounds(without):
+                return f"drop {self.label(instance)}", others
+            for candidate in regression.scan(others)[0][:3]:
+                other_shape = candidate.instance.term != instance.term
+                if not other_shape or without.log_evidence + candidate.gain < fit.log_evidence + 0.5:
+                    continue
+                if self.repeats(candidate.instance, others):
+                    continue
+                refined = self.refine_shape(regression, others, candidate.instance)
+                trial = regression.fit([*others, refined])
+                if trial.log_evidence > fit.log_evidence + 0.5 and regression.within_bounds(trial):
+                    return f"exchange {self.label(instance)} for {self.label(refined)}", (*others, refined)
+            reshaped = self.best_split(regression, others, instance, fit)
+            if reshaped is not None:
+                return reshaped
+        return None
+
+    def best_split(
+        self, regression: WhitenedRegression, others: tuple[Instance, ...], instance: Instance, fit: Fit
+    ) -> tuple[str, tuple[Instance, ...]] | None:
+        """Whether an instance stands for two causes: another shape of it together with one more term.
+
+        A single step cannot find this. A wide Stribeck curve passes for Coulomb plus a narrow one, and at its width
+        adding Coulomb friction gains nothing.
+        """
+        if len(self.problem.terms[instance.term].shapes) < 2:
+            return None
+        for candidate in regression.scan(others)[0]:
+            term = self.problem.terms[candidate.instance.term]
+            if (
+                candidate.instance.term == instance.term
+                or term.repeatable
+                or not math.isfinite(candidate.gain)
+            ):
+                continue
+            again = regression.scan([*others, candidate.instance], only=[instance.term])[0]
+            if not again or not math.isfinite(again[0].gain):
+                continue
+            split = (
+                *others,
+                candidate.instance,
+                self.refine_shape(regression, [*others, candidate.instance], again[0].instance),
+            )
+            trial = regression.fit(split)
+            if (
+                trial.log_evidence > fit.log_evidence + self.settings.lenient_gain
+                and regression.within_bounds(trial)
+            ):
+                return (
+                    f"split {self.label(instance)} into {self.label(split[-2])} and {self.label(split[-1])}",
+                    split,
+                )
+        return None
+
+    # -- 2 calibrate --------------------------------------------------------------------------------------------
+
+    def surrogates(self, regression: WhitenedRegression, fit: Fit) -> FloatArray:
+        """Whitened targets of pure noise (R, N): the residual with its spectrum kept and its phases drawn at random.
+
+        The spectrum keeps whatever colour the whitening left; random phases break every tie with the motion. The phases
+        are shared by the channels, which keeps their correlation.
+        """
+        residual = regression.spread(regression.whitened_residual(fit))
+        targets = []
+        for _ in range(self.settings.surrogates):
+            shuffled = np.zeros_like(residual)
+            for piece in segment_slices(self.problem.segment):
+                shuffled[piece] = _phase_randomised(residual[piece], self.rng)
+            targets.append(regression.gather(shuffled))
+        return np.stack(targets, axis=1)
+
+    def calibrate(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> float:
+        """Gain that noise alone reaches in the wanted share of recordings: Gumbel tail of the surrogates' largest gains."""
+        fit = regression.fit(instances)
+        targets = self.surrogates(regression, fit)
+        largest = np.array(
+            [max(c.gain for c in found) if found else 0.0 for found in regression.scan((), targets)]
+        )
+        largest = np.maximum(largest[np.isfinite(largest)], 0.0)
+        if len(largest) < 10:
+            return self.settings.smallest_threshold
+        spread = float(np.std(largest)) * math.sqrt(6.0) / math.pi
+        place = float(np.mean(largest)) - 0.5772 * spread
+        tail = place - spread * math.log(-math.log(1.0 - self.settings.false_alarm_rate))
+        self.progress(
+            f"surrogates: largest gain of noise {np.median(largest):.1f} (median), threshold {tail:.1f} nats"
+        )
+        return max(self.settings.smallest_threshold, tail)
+
+    # -- 3 prune ------------------------------------------------------------------------------------------------
+
+    def prune(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], threshold: float
+    ) -> Selection:
+        """Drop the weakest term until all that remain pass every gate."""
+        rejected: set[tuple[int, tuple[tuple[str, float], ...]]] = set()
+        while True:
+            fit = regression.fit(instances)
+            losses, held_out, shares = self.judge(regression, instances, fit)
+            failing = [
+                (loss, index)
+                for index, (loss, gain, share) in enumerate(zip(losses, held_out, shares, strict=True))
+                if loss < threshold or gain <= 0.0 or share < 1.0
+            ]
+            if not failing:
+                break
+            loss, index = min(failing)
+            reason = (
+                "below the threshold"
+                if loss < threshold
+                else "no gain held out"
+                if held_out[index] <= 0.0
+                else "below the details that remain"
+            )
+            self.progress(f"- {self.label(instances[index])}: {loss:.1f} nats, {reason}")
+            self.ladder.append(
+                LadderStep(f"drop {self.label(instances[index])}", loss, held_out[index], reason)
+            )
+            rejected.add((instances[index].term, instances[index].shape))
+            instances = instances[:index] + instances[index + 1 :]
+            exchange = self.best_exchange(regression, instances, regression.fit(instances))
+            if exchange is not None and not any((i.term, i.shape) in rejected for i in exchange[1]):
+                self.progress(exchange[0])
+                instances = exchange[1]
+        regression = self.whiten_at(self.residual_of(instances))
+        fit = regression.fit(instances)
+        losses, held_out, _ = self.judge(regression, instances, fit)
+        for index, instance in enumerate(instances):
+            self.ladder.append(LadderStep(self.label(instance), losses[index], held_out[index], "named"))
+        return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), tuple(self.ladder))
+
+    def judge(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
+    ) -> tuple[list[float], list[float], list[float]]:
+        """Per instance: evidence lost without it, held-out gain [nats], contribution against the smallest that counts."""
+        if not instances:
+            return [], [], []
+        residual = regression.unwhitened_residual(fit)
+        valid = self.problem.valid
+        remains = np.array([robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])])
+        full_scores = regression.block_scores(instances)
+        losses, held_out, contributions = [], [], []
+        position = len(self.problem.nuisances)
+        for index, instance in enumerate(instances):
+            others = instances[:index] + instances[index + 1 :]
+            without = regression.fit(others)
+            losses.append(fit.log_evidence - without.log_evidence)
+            # Held-out error alone would not mind a mass far outside its tolerance; the description would.
+            retuning = regression.tolerance_cost(without) - regression.tolerance_cost(fit)
+            held_out.append(0.5 * float(np.sum(regression.block_scores(others) - full_scores)) + retuning)
+            columns = self.problem.terms[instance.term].columns(dict(instance.shape))[
+                ..., list(instance.active)
+            ]
+            part = columns @ fit.mean[position : position + len(instance.active)]
+            position += len(instance.active)
+            sizes = [
+                float(np.sqrt(np.mean(part[valid[:, c], c] ** 2))) if valid[:, c].any() else 0.0
+                for c in range(len(remains))
+            ]
+            contributions.append(sizes)
+        total = np.sqrt(np.sum(np.square(contributions), axis=0))
+        floor = np.maximum(self.settings.smallest_share * remains, self.settings.smallest_part * total)
+        shares = [float(np.max(np.asarray(sizes) / np.maximum(floor, 1e-300))) for sizes in contributions]
+        return losses, held_out, shares
+
+    def label(self, instance: Instance) -> str:
+        """Effect, target and shape in one short text."""
+        term = self.problem.terms[instance.term]
+        shape = ", ".join(f"{name} {value:.4g}" for name, value in instance.shape if name in term.resolution)
+        return f"{term.key} ({shape})" if shape else term.key
+
+
+def _phase_randomised(values: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Random phases on the spectrum of (T, C); the mean is drawn like its slow neighbours, since a fit has removed it."""
+    spectrum = np.fft.rfft(values, axis=0)
+    phases = np.exp(2j * np.pi * rng.random(len(spectrum)))[:, None]
+    randomised = spectrum * phases
+    neighbours = np.sqrt(np.mean(np.abs(spectrum[1 : SLOW_ORDINATES + 1]) ** 2, axis=0))
+    randomised[0] = neighbours * rng.standard_normal()
+    result: FloatArray = np.fft.irfft(randomised, n=len(values), axis=0)
+    return result

@@ -1,0 +1,221 @@
+"""The noise of a recording: its colour per channel, and how the channels share it.
+
+Residuals of filtered and differentiated signals are never white, and without their colour every p-value is wrong. The
+colour is an autoregression fitted with Huber weights (a real residual has bursts that a Gaussian has not), whose
+spectrum S(f) is then made non-decreasing:
+
+    S_w(f) = max over f' <= f of S(f'),      whitening filter = the minimum-phase root of 1 / S_w.
+
+So the analysis may trust slow time scales more than fast ones (the noise of derivatives is blue), never the reverse. A
+red residual is mostly what the model still leaves out; whitening it fully would turn the fit into one of the signal's
+edges, where reversals and resonances make every simple model wrong. Such a residual is taken as white with the power of
+its slow part: parameters stay those of a least-squares fit, intervals and evidence count only independent stretches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from .regression_problem import BoolArray, FloatArray, IntArray, segment_slices
+
+HUBER = 4.0  # in robust standard deviations: spares a Gaussian and tames bursts
+AUTOREGRESSION_ORDER = 8
+LONGEST_FILTER = 24
+# Periodogram ordinates averaged for the slowest noise: enough that the mean is good to a third, few enough to see a drift.
+SLOW_ORDINATES = 8
+_SPECTRUM_POINTS = 512
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseModel:
+    """Whitening filters (C, L) whose outputs have at most unit variance, and their correlation (C, C)."""
+
+    taps: FloatArray
+    correlation: FloatArray
+
+    @property
+    def memory(self) -> int:
+        """Samples before the present one that the filters look at."""
+        return int(self.taps.shape[1]) - 1
+
+    def filtered(self, values: FloatArray, segment: IntArray) -> FloatArray:
+        """Filter (T, C) or (T, C, K) channel by channel; the first `memory` samples of a segment become NaN."""
+        memory = self.memory
+        result = np.full(values.shape, np.nan)
+        extra = (1,) * (values.ndim - 2)
+        for piece in segment_slices(segment):
+            block = values[piece]
+            if len(block) <= memory:
+                continue
+            out = self.taps[:, 0].reshape(1, -1, *extra) * block[memory:]
+            for lag in range(1, memory + 1):
+                out += self.taps[:, lag].reshape(1, -1, *extra) * block[memory - lag : len(block) - lag]
+            result[piece.start + memory : piece.stop] = out
+        return result
+
+    def usable(self, valid: BoolArray, segment: IntArray) -> BoolArray:
+        """Samples whose whole filter window is valid, (T, C)."""
+        usable = np.zeros_like(valid)
+        for piece in segment_slices(segment):
+            block = valid[piece]
+            if len(block) <= self.memory:
+                continue
+            window = block[self.memory :].copy()
+            for lag in range(1, self.memory + 1):
+                window &= block[self.memory - lag : len(block) - lag]
+            usable[piece.start + self.memory : piece.stop] = window
+        return usable
+
+    def whiten(self, values: FloatArray, valid: BoolArray, segment: IntArray) -> FloatArray:
+        """Return whitened values: (T, C) or (T, C, K) -> the same shape, zero where not usable.
+
+        Rows with some channels masked are decorrelated with the correlation of the others.
+        """
+        filtered = self.filtered(values, segment)
+        usable = self.usable(valid, segment)
+        white = np.zeros_like(filtered)
+        codes = usable @ (1 << np.arange(usable.shape[1], dtype=np.int64))
+        for code in np.unique(codes):
+            if code == 0:
+                continue
+            rows = np.flatnonzero(codes == code)
+            present = np.flatnonzero(usable[rows[0]])
+            root = np.linalg.cholesky(self.correlation[np.ix_(present, present)])
+            block = np.moveaxis(filtered[np.ix_(rows, present)], 1, 0)
+            solved = np.linalg.solve(root, block.reshape(len(present), -1)).reshape(block.shape)
+            white[np.ix_(rows, present)] = np.moveaxis(solved, 0, 1)
+        return white
+
+
+def huber_weights(standardised: FloatArray) -> FloatArray:
+    """Weights min(1, HUBER / |x|) of standardised values."""
+    size = np.abs(standardised)
+    return np.where(size > HUBER, HUBER / np.maximum(size, 1e-300), 1.0)
+
+
+def robust_deviation(values: FloatArray) -> float:
+    """Standard deviation with Huber weights around zero, started at the median absolute value."""
+    if len(values) == 0:
+        return 1.0
+    deviation = 1.4826 * float(np.median(np.abs(values)))
+    if deviation <= 0.0:
+        deviation = float(np.sqrt(np.mean(values**2)))
+    if deviation <= 0.0:
+        return 1e-300
+    for _ in range(3):
+        weight = huber_weights(values / deviation)
+        deviation = float(np.sqrt(np.sum(weight * values**2) / np.sum(weight)))
+    return max(deviation, 1e-300)
+
+
+def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -> NoiseModel:
+    """Estimate the noise model from a residual (T, C)."""
+    channels = residual.shape[1]
+    longest = max((piece.stop - piece.start for piece in segment_slices(segment)), default=0)
+    order = int(max(0, min(AUTOREGRESSION_ORDER, longest // 20)))
+    filters = []
+    for channel in range(channels):
+        coefficients, deviation = _autoregression(residual[:, channel], valid[:, channel], segment, order)
+        slow = slow_power(residual[:, channel], valid[:, channel], segment)
+        filters.append(_whitening_taps(coefficients, deviation, slow))
+    length = max(len(taps) for taps in filters)
+    length = max(1, min(length, longest // 4 + 1))
+    taps = np.zeros((channels, length))
+    for channel, own in enumerate(filters):
+        taps[channel, : min(length, len(own))] = own[:length]
+    model = NoiseModel(taps, np.eye(channels))
+    return NoiseModel(taps, _correlation(model.filtered(residual, segment), model.usable(valid, segment)))
+
+
+def white_noise_model(residual: FloatArray, valid: BoolArray) -> NoiseModel:
+    """The model that takes a residual (T, C) for white: least squares, channel by channel."""
+    deviations = [robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])]
+    return NoiseModel(1.0 / np.array(deviations)[:, None], np.eye(residual.shape[1]))
+
+
+def _autoregression(
+    values: FloatArray, valid: BoolArray, segment: IntArray, order: int
+) -> tuple[FloatArray, float]:
+    """Coefficients (order,) and innovation deviation, by iteratively reweighted least squares."""
+    window = NoiseModel(np.ones((1, order + 1)), np.eye(1))
+    rows = np.flatnonzero(window.usable(valid[:, None], segment)[:, 0])
+    if len(rows) < 5 * (order + 1):
+        usable = values[valid]
+        return np.zeros(0), robust_deviation(usable)
+    target = values[rows]
+    lags = (
+        np.stack([values[rows - lag] for lag in range(1, order + 1)], axis=1)
+        if order
+        else np.zeros((len(rows), 0))
+    )
+    weight = np.ones(len(rows))
+    ridge = 1e-8 * float(np.sum(target**2)) + 1e-300
+    coefficients: FloatArray = np.zeros(order)
+    for _ in range(4):
+        weighted = lags * weight[:, None]
+        coefficients = np.asarray(
+            np.linalg.solve(lags.T @ weighted + ridge * np.eye(order), weighted.T @ target), float
+        )
+        innovation = target - lags @ coefficients
+        weight = huber_weights(innovation / robust_deviation(innovation))
+    return coefficients, robust_deviation(target - lags @ coefficients)
+
+
+def slow_power(values: FloatArray, valid: BoolArray, segment: IntArray) -> float:
+    """Spectral density at the slowest time scales that a recording resolves, in units of white noise of variance 1.
+
+    A short autoregression knows nothing of drifts over seconds; the mean of the first periodogram ordinates does. Masked
+    samples count as zero.
+    """
+    powers = []
+    for piece in segment_slices(segment):
+        usable = valid[piece]
+        if usable.sum() < 8 * SLOW_ORDINATES:
+            continue
+        masked = np.where(usable, values[piece], 0.0)
+        ordinates = np.abs(np.fft.rfft(masked)[1 : SLOW_ORDINATES + 1]) ** 2 / usable.sum()
+        powers.append((float(np.mean(ordinates)), int(usable.sum())))
+    if not powers:
+        return 0.0
+    return sum(power * count for power, count in powers) / sum(count for _, count in powers)
+
+
+def _whitening_taps(coefficients: FloatArray, deviation: float, slow: float) -> FloatArray:
+    """Minimum-phase filter of 1 / S_w, with S_w the running maximum of `slow` and the autoregression's spectrum."""
+    polynomial = np.zeros(2 * _SPECTRUM_POINTS)
+    polynomial[0] = 1.0
+    polynomial[1 : len(coefficients) + 1] = -coefficients
+    response = np.abs(np.fft.rfft(polynomial)) ** 2
+    spectrum = deviation**2 / np.maximum(response, 1e-12)
+    rising = np.maximum.accumulate(np.maximum(spectrum, slow))
+    # Minimum phase by the folded cepstrum.
+    cepstrum = np.fft.irfft(-0.5 * np.log(rising))
+    folded = np.zeros_like(cepstrum)
+    half = len(cepstrum) // 2
+    folded[0] = cepstrum[0]
+    folded[1:half] = 2.0 * cepstrum[1:half]
+    taps = np.fft.irfft(np.exp(np.fft.rfft(folded)))[:LONGEST_FILTER]
+    needed = np.flatnonzero(np.abs(taps) > 2e-3 * abs(taps[0]))
+    result: FloatArray = taps[: needed[-1] + 1]
+    return result
+
+
+def _correlation(filtered: FloatArray, usable: BoolArray) -> FloatArray:
+    """Correlation of the filtered channels with outliers clipped, slightly shrunk to the identity."""
+    channels = filtered.shape[1]
+    together = usable.all(axis=1)
+    if channels == 1 or together.sum() <= 10 * channels:
+        return np.eye(channels)
+    values = filtered[together]
+    scale = np.array([robust_deviation(values[:, channel]) for channel in range(channels)])
+    standard = values / scale
+    clipped = standard * huber_weights(standard)
+    covariance = clipped.T @ clipped / len(clipped)
+    deviation = np.sqrt(np.diag(covariance))
+    shrink = min(0.5, 2.0 * channels / len(clipped))
+    result: FloatArray = (1.0 - shrink) * covariance / np.outer(deviation, deviation) + shrink * np.eye(
+        channels
+    )
+    return result

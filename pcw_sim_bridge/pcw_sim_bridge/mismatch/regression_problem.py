@@ -1,0 +1,186 @@
+"""What the analyser solves: residual channels, what may explain them, and how far a healthy system may differ.
+
+Along a recording the nominal model leaves a residual r (T, C). To first order
+
+    r = N nu + sum_j Phi_j(shape_j) theta_j + noise
+
+with nuisance columns N (the description's numbers, each known to within its tolerance: nu ~ Normal(0, sd^2)) and, for
+every candidate effect j on a target, columns Phi_j that are linear in the parameters theta_j and depend on a few
+shaping parameters (the speed of a Stribeck curve, the order of a cogging). A builder (bench axis, robot) writes the
+problem; the engine knows nothing of axes and robots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+Shape = Mapping[str, float]  # values of the shaping parameters of one candidate
+
+
+@dataclasses.dataclass(frozen=True)
+class Channel:
+    """One residual signal, by its public name (INTERFACES section 6)."""
+
+    name: str
+    unit: str
+    casters: tuple[str, ...] = ()
+    axis: str = "chassis"
+
+
+@dataclasses.dataclass(frozen=True)
+class Nuisance:
+    """A number of the description that a healthy system may differ in.
+
+    Attributes:
+        nominal: value in the description, in `unit`.
+        deviation: standard deviation, same unit.
+        column: d residual / d value, (T, C).
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    deviation: float
+    column: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearParameter:
+    """A parameter the columns are proportional to; a fit outside [lower, upper] is no explanation.
+
+    Attributes:
+        refinement: zero unless there is evidence for it; not part of the effect when it is first named.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    deviation: float
+    refinement: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """A candidate: one effect on one target.
+
+    Attributes:
+        effect: name in the vocabulary.
+        target: casters, ("chassis",), ("axis",) ...
+        parameters: the linear ones.
+        shapes: the grid of shaping parameters to begin with; one empty mapping where there are none.
+        columns: shape -> (T, C, len(parameters)), the contribution to the residual per unit of each parameter.
+        arguments: names of the problem's variables that the contribution depends on.
+        repeatable: several instances with different shapes may be at work at once (harmonics of a cogging).
+        resolution: spacing of `shapes` per shaping parameter; local search stays within it.
+        scan: cheaper, slightly inexact columns of all `shapes` at once, (T, C, len(shapes), len(parameters)), where the
+            grid is long; None uses `columns`.
+    """
+
+    effect: str
+    target: tuple[str, ...]
+    parameters: tuple[LinearParameter, ...]
+    shapes: tuple[Shape, ...]
+    columns: Callable[[Shape], FloatArray]
+    arguments: tuple[str, ...] = ()
+    repeatable: bool = False
+    resolution: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
+    scan: Callable[[], FloatArray] | None = None
+
+    @property
+    def key(self) -> str:
+        """Short label for logs and tables."""
+        return f"{self.effect}/{'+'.join(self.target)}"
+
+    def base_indices(self) -> tuple[int, ...]:
+        """Positions of the parameters that are not refinements."""
+        return tuple(i for i, parameter in enumerate(self.parameters) if not parameter.refinement)
+
+
+@dataclasses.dataclass(frozen=True)
+class RegressionProblem:
+    """Residuals and what may explain them, all on one regular time grid per segment.
+
+    Attributes:
+        time: stamps (T,) [s], from the start of each recording.
+        segment: index of the contiguous piece of each sample (T,); filters never cross a border.
+        recording: index of the recording of each sample (T,).
+        rate: samples per second.
+        measured: the measured side of each channel (T, C), for error ratios; residual = measured - predicted.
+        valid: samples that may be judged (T, C).
+        variables: what a leftover may depend on: name -> (T,).
+    """
+
+    channels: tuple[Channel, ...]
+    time: FloatArray
+    segment: IntArray
+    recording: IntArray
+    rate: float
+    measured: FloatArray
+    residual: FloatArray
+    valid: BoolArray
+    nuisances: tuple[Nuisance, ...]
+    terms: tuple[Term, ...]
+    variables: Mapping[str, FloatArray]
+
+    def __post_init__(self) -> None:
+        """Check shapes once, so that the engine need not.
+
+        Raises:
+            ValueError: arrays that do not fit together.
+        """
+        shape = (len(self.time), len(self.channels))
+        for name in ("measured", "residual", "valid"):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape} instead of {shape}")
+        for nuisance in self.nuisances:
+            if nuisance.column.shape != shape:
+                raise ValueError(
+                    f"nuisance {nuisance.name} has shape {nuisance.column.shape} instead of {shape}"
+                )
+        if not np.isfinite(self.residual[self.valid]).all():
+            raise ValueError("residual holds NaN at samples said to be valid")
+
+    def nuisance_columns(self) -> FloatArray:
+        """Nuisance columns side by side, (T, C, K)."""
+        if not self.nuisances:
+            return np.zeros((*self.residual.shape, 0))
+        return np.stack([nuisance.column for nuisance in self.nuisances], axis=2)
+
+    def nuisance_deviations(self) -> FloatArray:
+        """Tolerances (K,)."""
+        return np.array([nuisance.deviation for nuisance in self.nuisances])
+
+
+def segment_slices(segment: IntArray) -> list[slice]:
+    """Return the slices of constant `segment`, in order."""
+    borders = np.flatnonzero(np.diff(segment)) + 1
+    edges = [0, *borders.tolist(), len(segment)]
+    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+
+
+def contiguous_blocks(segment: IntArray, count: int) -> IntArray:
+    """Cut the samples into about `count` blocks of equal length that never cross a segment border, (T,)."""
+    block = np.zeros(len(segment), dtype=np.int64)
+    length = max(1, len(segment) // max(1, count))
+    next_block = 0
+    for piece in segment_slices(segment):
+        size = piece.stop - piece.start
+        parts = max(1, round(size / length))
+        block[piece] = next_block + (np.arange(size) * parts) // size
+        next_block += parts
+    return block
+
+
+def concatenate_variables(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Join the variables of several segments; only those that all of them have."""
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
