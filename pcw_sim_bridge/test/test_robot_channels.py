@@ -1,0 +1,114 @@
+"""The channels of a robot: a healthy one is silent, a changed number and an effect show up where and as large as they are."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pcw_description import RobotDescription, load_robot
+from pcw_description.effects.effect import EffectInstance
+from pcw_description.recording import Recording
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.simulated_run import record_run
+
+DURATION = 16.0
+
+
+def wandering(time: float) -> np.ndarray:
+    """Return a twist that moves all three axes at speeds of no common period."""
+    ramp = min(time, 1.0)
+    return ramp * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
+
+
+def record(folder: Path, robot: RobotDescription, seed: int, plant: str = "reduced") -> Recording:
+    """Drive `robot` under a controller that knows only the nominal one."""
+    path = folder / f"run{seed}"
+    record_run(robot, wandering, DURATION, seed, path, plant, controlled_as=load_robot("thesis"))
+    return Recording.open(path, load_robot("thesis"))
+
+
+def column_fit(builder: RobotProblemBuilder, column: np.ndarray) -> tuple[float, float]:
+    """Return the least-squares coefficient of one column (T, C) in the residual, and the share of power it explains."""
+    problem = builder.build()
+    scale = np.sqrt(np.mean(problem.measured**2, axis=0))
+    target = np.where(problem.valid, problem.residual / scale, 0.0)
+    explaining = np.where(problem.valid, column / scale, 0.0)
+    coefficient = float(np.sum(target * explaining) / np.sum(explaining**2))
+    left = target - coefficient * explaining
+    return coefficient, float(1.0 - np.sum(left**2) / np.sum(target**2))
+
+
+@pytest.mark.parametrize("plant", ["reduced", "pybullet"])
+def test_a_healthy_robot_leaves_next_to_nothing(tmp_path: Path, plant: str) -> None:
+    """Wrench residuals below 4 % of the wrench in the plane, below 12 % on springs that pitch."""
+    problem = RobotProblemBuilder(load_robot("thesis"), [record(tmp_path, load_robot("thesis"), 1, plant)]).build()
+    assert [channel.name for channel in problem.channels] == [
+        "chassis_force/x", "chassis_force/y", "chassis_torque/z", "gyro", "accelerometer/x", "accelerometer/y",
+    ]
+    assert problem.valid.mean() > 0.85
+    residual = np.sqrt(np.mean(np.where(problem.valid, problem.residual, 0.0) ** 2, axis=0))
+    measured = np.sqrt(np.mean(problem.measured**2, axis=0))
+    assert np.all(residual[:3] < (0.04 if plant == "reduced" else 0.12) * measured[:3])
+    assert residual[3] < 2e-3
+
+
+def test_a_changed_number_is_its_nuisance(tmp_path: Path) -> None:
+    """3 kg more chassis and a wheel heading read 20 mrad wrong come out with their size, through their own columns."""
+    nominal = load_robot("thesis")
+    heavier = dataclasses.replace(nominal, chassis=dataclasses.replace(nominal.chassis, mass=nominal.chassis.mass + 3.0))
+    builder = RobotProblemBuilder(nominal, [record(tmp_path, heavier, 2)])
+    columns = {nuisance.name: nuisance.column for nuisance in builder.build().nuisances}
+    coefficient, explained = column_fit(builder, columns["chassis.mass"])
+    assert coefficient == pytest.approx(3.0, abs=0.6)
+    assert explained > 0.5
+    # The same column applied to a problem whose numbers are varied on purpose: the difference quotient is consistent.
+    builder.numbers.steer_zero[1] += 0.02
+    varied = builder.build()
+    builder.numbers.steer_zero[1] -= 0.02
+    plain = builder.build()
+    moved = (plain.residual - varied.residual) / 0.02
+    steer_zero = columns["steer_zero/front_right"]
+    assert np.sqrt(np.mean((moved - steer_zero) ** 2)) < 0.05 * np.sqrt(np.mean(steer_zero**2))
+
+
+@pytest.mark.parametrize("plant", ["reduced", "pybullet"])
+def test_an_effect_is_its_own_column(tmp_path: Path, plant: str) -> None:
+    """Coulomb friction on one drive: its column gives the torque within 5 %, those of the other drives explain less."""
+    nominal = load_robot("thesis")
+    friction = EffectInstance("drive_coulomb_friction", ("rear_right",), {"coulomb": 0.6, "asymmetry": 0.0, "smoothing_speed": 0.05})
+    builder = RobotProblemBuilder(nominal, [record(tmp_path, dataclasses.replace(nominal, physics=(friction,)), 3, plant)])
+    problem = builder.build()
+    explained = {}
+    for index, term in enumerate(problem.terms):
+        if term.effect == "drive_coulomb_friction":
+            instance = Instance(index, tuple(sorted(term.shapes[0].items())), (0,))
+            column = term.columns(dict(instance.shape))[:, :, 0]
+            explained[term.target] = column_fit(builder, column)
+    coefficient, share = explained["rear_right",]
+    assert coefficient == pytest.approx(0.6, rel=0.05)
+    assert share == max(part for _, part in explained.values()) > 0.7
+
+
+def test_an_effect_that_the_description_holds_is_not_left_over(tmp_path: Path) -> None:
+    """With the friction in the robot file the residual is that of a healthy robot again: a patched file is nominal."""
+    nominal = load_robot("thesis")
+    friction = EffectInstance("drive_coulomb_friction", ("rear_right",), {"coulomb": 0.6, "asymmetry": 0.0, "smoothing_speed": 0.05})
+    patched = dataclasses.replace(nominal, physics=(friction,))
+    recording = record(tmp_path, patched, 4)
+    before = RobotProblemBuilder(nominal, [recording]).build()
+    after = RobotProblemBuilder(patched, [recording]).build()
+    rms = [np.sqrt(np.mean(np.where(p.valid, p.residual, 0.0)[:, :3] ** 2, axis=0)) for p in (before, after)]
+    assert np.all(rms[1][:2] < 0.3 * rms[0][:2])
+
+
+def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path: Path) -> None:
+    """b_x = 0 leaves no torque balance; the channels say so by their names."""
+    recording = record(tmp_path, load_robot("thesis"), 5)
+    swerve = load_robot("thesis")
+    swerve = dataclasses.replace(
+        swerve, casters=tuple(dataclasses.replace(caster, caster_offset=(0.0, 0.0)) for caster in swerve.casters)
+    )
+    problem = RobotProblemBuilder(swerve, [recording]).build()
+    assert [channel.name for channel in problem.channels] == ["gyro", "accelerometer/x", "accelerometer/y"]
+    assert problem.terms == ()
