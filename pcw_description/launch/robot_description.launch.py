@@ -16,18 +16,30 @@ def nodes(context: LaunchContext) -> list[Node]:
     """Return the one node that publishes the URDF of the robot that the argument names."""
     robot = LaunchConfiguration("robot").perform(context)
     if LaunchConfiguration("frames").perform(context).lower() not in ("true", "1"):
-        return [Node(package="pcw_description", executable="robot_description", parameters=[{"robot": robot}])]
+        return [
+            Node(package="pcw_description", executable="robot_description", parameters=[{"robot": robot}])
+        ]
     # robot_state_publisher publishes the URDF itself; two publishers of one latched topic would be one too many.
     urdf = robot_urdf(load_robot(robot))
-    return [Node(package="robot_state_publisher", executable="robot_state_publisher", parameters=[{"robot_description": urdf}])]
+    return [
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            parameters=[{"robot_description": urdf}],
+        )
+    ]
 
 
 def generate_launch_description() -> LaunchDescription:
     """Entry point of `ros2 launch`."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument("robot", default_value="thesis", description="a .yaml file or a shipped robot"),
-            DeclareLaunchArgument("frames", default_value="false", description="use robot_state_publisher, which must be there"),
+            DeclareLaunchArgument(
+                "robot", default_value="thesis", description="a .yaml file or a shipped robot"
+            ),
+            DeclareLaunchArgument(
+                "frames", default_value="false", description="use robot_state_publisher, which must be there"
+            ),
             OpaqueFunction(function=nodes),
         ]
     )

@@ -16,7 +16,6 @@ Appendix B of the thesis prints entries with errors; this is derived anew and te
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -32,12 +31,21 @@ def dynamic_parameters(robot: RobotDescription) -> tuple[FloatArray, FloatArray]
         steering axis), I_zz, wheel inertia about the axle, armature (drive, drive), (drive, steer), (steer, steer),
         wheel radius.
     """
-    chassis = np.array([robot.chassis.mass, robot.chassis.com[0], robot.chassis.com[1], robot.chassis.inertia_zz])
+    chassis = np.array(
+        [robot.chassis.mass, robot.chassis.com[0], robot.chassis.com[1], robot.chassis.inertia_zz]
+    )
     modules = np.array(
         [
             [
-                caster.module.mass, caster.module.com[0], caster.module.com[1], caster.module.inertia_zz,
-                caster.wheel.inertia_axle, armature[0, 0], armature[0, 1], armature[1, 1], caster.wheel_radius,
+                caster.module.mass,
+                caster.module.com[0],
+                caster.module.com[1],
+                caster.module.inertia_zz,
+                caster.wheel.inertia_axle,
+                armature[0, 0],
+                armature[0, 1],
+                armature[1, 1],
+                caster.wheel_radius,
             ]
             for caster, armature in zip(robot.casters, robot.armature, strict=True)
         ]
@@ -50,7 +58,14 @@ def augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_a
     """Return Lambda (3, 3) and theta (3,); see the module's docstring. Written in scalars for speed."""
     mass, cx, cy = chassis[0], chassis[1], chassis[2]
     vx, vy, omega = twist[0], twist[1], twist[2]
-    l00, l01, l02, l11, l12, l22 = mass, 0.0, -mass * cy, mass, mass * cx, chassis[3] + mass * (cx * cx + cy * cy)
+    l00, l01, l02, l11, l12, l22 = (
+        mass,
+        0.0,
+        -mass * cy,
+        mass,
+        mass * cx,
+        chassis[3] + mass * (cx * cx + cy * cy),
+    )
     t0 = -mass * (omega * vy + omega * omega * cx)
     t1 = mass * (omega * vx - omega * omega * cy)
     t2 = mass * omega * (cx * vx + cy * vy)
@@ -72,7 +87,11 @@ def augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_a
         m_rs = -m * radius * dy
         m_ss = modules[i, 3] + m * (dx * dx + dy * dy)
         # M C, column by column, then C^T (M C); only the upper triangle is formed.
-        a0, a1, a2 = m_rr * r0 + m_rp * p0 + m_rs * s0, m_rr * r1 + m_rp * p1 + m_rs * s1, m_rr * r2 + m_rp * p2 + m_rs * s2
+        a0, a1, a2 = (
+            m_rr * r0 + m_rp * p0 + m_rs * s0,
+            m_rr * r1 + m_rp * p1 + m_rs * s1,
+            m_rr * r2 + m_rp * p2 + m_rs * s2,
+        )
         b0, b1, b2 = m_rp * r0 + m_pp * p0, m_rp * r1 + m_pp * p1, m_rp * r2 + m_pp * p2
         g0, g1, g2 = m_rs * r0 + m_ss * s0, m_rs * r1 + m_ss * s1, m_rs * r2 + m_ss * s2
         l00 += r0 * a0 + p0 * b0 + s0 * g0
@@ -114,7 +133,12 @@ class AugmentedObjectModel:
     def __init__(self, robot: RobotDescription) -> None:
         robot.require_torque_control()
         chassis, modules = dynamic_parameters(robot)
-        self._numbers: tuple[Any, ...] = (chassis, modules, robot.steer_axis, robot.caster_offset)
+        self._numbers: tuple[FloatArray, FloatArray, FloatArray, FloatArray] = (
+            chassis,
+            modules,
+            robot.steer_axis,
+            robot.caster_offset,
+        )
 
     def evaluate(self, steer_angle: FloatArray, twist: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return Lambda and theta, (3.37)-(3.38).

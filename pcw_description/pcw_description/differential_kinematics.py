@@ -130,7 +130,9 @@ def wheel_centres(robot: RobotDescription, steer_angle: FloatArray) -> FloatArra
     return robot.steer_axis + np.stack([bx * c - by * s, bx * s + by * c], axis=1)
 
 
-def forward_kinematics(robot: RobotDescription, steer_angle: FloatArray, joint_velocity: FloatArray) -> FloatArray:
+def forward_kinematics(
+    robot: RobotDescription, steer_angle: FloatArray, joint_velocity: FloatArray
+) -> FloatArray:
     """Return the twist A^+ B q_dot that fits the joint rates best (least squares), (3.26).
 
     Args:
@@ -164,8 +166,8 @@ def inverse_kinematics(robot: RobotDescription, steer_angle: FloatArray, twist: 
     bx, by = robot.caster_offset[:, 0], robot.caster_offset[:, 1]
     if np.any(np.abs(bx) < MINIMUM_CASTER_OFFSET):
         raise KinematicsError(
-            f"{robot.name}: caster_offset[0] is {bx[np.argmin(np.abs(bx))]:g} m; the steering rate follows from the twist only "
-            f"for at least {MINIMUM_CASTER_OFFSET:g} m"
+            f"{robot.name}: caster_offset[0] is {bx[np.argmin(np.abs(bx))]:g} m; the steering rate follows "
+            f"from the twist only for at least {MINIMUM_CASTER_OFFSET:g} m"
         )
     velocity = (wheel_jacobian(robot, steer_angle) @ twist).reshape(-1, 2)
     steer_rate = -velocity[:, 1] / bx

@@ -85,7 +85,9 @@ def forward_displacement(
     return displacement, residual
 
 
-def inverse_displacement(robot: RobotDescription, steer_angle: FloatArray, displacement: FloatArray) -> FloatArray:
+def inverse_displacement(
+    robot: RobotDescription, steer_angle: FloatArray, displacement: FloatArray
+) -> FloatArray:
     """Return the joint displacements that move base_link by `displacement` without slip, (3.14).
 
     Args:
@@ -101,14 +103,18 @@ def inverse_displacement(robot: RobotDescription, steer_angle: FloatArray, displ
     """
     offset = robot.caster_offset
     if np.any(np.abs(offset[:, 0]) < MINIMUM_CASTER_OFFSET):
-        raise KinematicsError(f"{robot.name}: caster_offset[0] must be at least {MINIMUM_CASTER_OFFSET:g} m for inverse displacement")
+        raise KinematicsError(
+            f"{robot.name}: caster_offset[0] must be at least {MINIMUM_CASTER_OFFSET:g} m for inverse displacement"
+        )
     x, y, theta = displacement
     back = np.array([x, y]) - wheel_centres(robot, steer_angle)
     c, s = math.cos(theta), math.sin(theta)
     g = back @ np.array([[c, -s], [s, c]]) + robot.steer_axis  # rows R(-theta) (P - p) + S
     squared = np.sum(g**2, axis=1) - offset[:, 1] ** 2
     if np.any(squared < 0.0):
-        raise KinematicsError(f"{robot.name}: displacement {np.asarray(displacement).tolist()} is out of reach of a caster's offset")
+        raise KinematicsError(
+            f"{robot.name}: displacement {np.asarray(displacement).tolist()} is out of reach of a caster's offset"
+        )
     # The branch that is continuous with no motion: the axis stays on its side of the wheel.
     along = np.copysign(np.sqrt(squared), -offset[:, 0])
     heading = np.arctan2(g[:, 1], g[:, 0]) - np.arctan2(-offset[:, 1], along)

@@ -6,7 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement, TwistReference, initial_state
+
+from pcw_control.computed_torque import (
+    ComputedTorque,
+    ComputedTorqueMeasurement,
+    TwistReference,
+    initial_state,
+)
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.recording_writer import RecordingWriter
 from pcw_description.robot_description import FloatArray, RobotDescription
@@ -66,17 +72,25 @@ def record_run(
                 if step % every["joints"] == 0:
                     reading = encoders.read(truth, reading, every["joints"] * plant.dt, rng)
                     writer.write(
-                        "/joint_states", joint_state(stamp, robot.joint_names, reading.position, reading.velocity, reading.effort)
+                        "/joint_states",
+                        joint_state(
+                            stamp, robot.joint_names, reading.position, reading.velocity, reading.effort
+                        ),
                     )
                 if sensors.imu and step % every["imu"] == 0:
                     sensed = read_imu(sensors.imu, truth, rng)
                     writer.write("/imu/data", imu(stamp, sensed.angular_velocity, sensed.linear_acceleration))
                 if sensors.tracker and step % every["tracker"] == 0:
-                    writer.write("/ground_truth/odom", odometry(stamp, read_tracker(sensors.tracker, truth, rng), truth.twist))
+                    writer.write(
+                        "/ground_truth/odom",
+                        odometry(stamp, read_tracker(sensors.tracker, truth, rng), truth.twist),
+                    )
                 if step % every["control"] == 0 and reading is not None:
                     target = commanded_twist(truth.time)
                     writer.write("/cmd_vel", twist_stamped(stamp, target))
-                    measurement = ComputedTorqueMeasurement(reading.position, reading.velocity, np.zeros(3), saturated)
+                    measurement = ComputedTorqueMeasurement(
+                        reading.position, reading.velocity, np.zeros(3), saturated
+                    )
                     dt = every["control"] * plant.dt
                     state, wanted = controller.step(state, measurement, TwistReference(target), dt)
                     limited = limit_torque(limits, torque, wanted.torque, reading.velocity, dt)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 from pcw_description.wheel_dynamics import slip_ratio
 
@@ -39,13 +40,18 @@ def traction_rig(robot: RobotDescription) -> RobotDescription:
     weight = robot.total_mass * 9.81
     strong = 2.0 * robot.contact.mu_p * weight * robot.casters[0].wheel_radius
     module = dataclasses.replace(
-        robot.casters[0], limits=dataclasses.replace(robot.casters[0].limits, drive_torque=strong, steer_torque=strong)
+        robot.casters[0],
+        limits=dataclasses.replace(robot.casters[0].limits, drive_torque=strong, steer_torque=strong),
     )
     reach = float(np.max(np.abs(robot.steer_axis)))
     places = {"test": (reach, 0.0), "left": (-reach, reach), "right": (-reach, -reach)}
-    casters = tuple(dataclasses.replace(module, name=name, steer_axis=place) for name, place in places.items())
+    casters = tuple(
+        dataclasses.replace(module, name=name, steer_axis=place) for name, place in places.items()
+    )
     chassis = dataclasses.replace(robot.chassis, com=(-reach / 3.0, 0.0, robot.chassis.com[2]))
-    return dataclasses.replace(robot, name=f"{robot.name}_traction_rig", casters=casters, chassis=chassis, physics=())
+    return dataclasses.replace(
+        robot, name=f"{robot.name}_traction_rig", casters=casters, chassis=chassis, physics=()
+    )
 
 
 def measure_traction(
@@ -53,7 +59,8 @@ def measure_traction(
 ) -> TractionCurve:
     """Drive a `traction_rig` straight at `speed` and bring its first wheel to each slip ratio in turn.
 
-    The wheel under test is speed controlled to the true speed / (1 - lambda); the others keep the robot's speed, all headings are
+    The wheel under test is speed controlled to the true speed / (1 - lambda); the others keep the robot's speed, all headings
+    are
     held at zero.
 
     Args:
@@ -90,10 +97,14 @@ def measure_traction(
         error = wanted_speed - state.twist[0]
         body_integral += error * plant.dt
         torque[:, DRIVE] = body_gain * (error + 5.0 * body_integral)
-        wheel_error = state.twist[0] / (1.0 - target_slip) / radius[caster] - state.joint_velocity[caster, DRIVE]
+        wheel_error = (
+            state.twist[0] / (1.0 - target_slip) / radius[caster] - state.joint_velocity[caster, DRIVE]
+        )
         integral += wheel_error * plant.dt
         torque[caster, DRIVE] = wheel_gain * (wheel_error + 400.0 * integral)
-        torque[:, STEER] = -steer_inertia * (900.0 * state.joint_position[:, STEER] + 60.0 * state.joint_velocity[:, STEER])
+        torque[:, STEER] = -steer_inertia * (
+            900.0 * state.joint_position[:, STEER] + 60.0 * state.joint_velocity[:, STEER]
+        )
         return torque
 
     while wanted_speed < speed:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+
 from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement, initial_state
 from pcw_control.quintic_trajectory import TrajectoryPoint
 from pcw_description import load_robot
@@ -33,7 +34,9 @@ def reference(path: Callable[[float], np.ndarray], rate: float, time: float) -> 
         if t >= RAMP:
             return rate * (t - RAMP / 2)
         x = max(t, 0.0) / RAMP
-        return rate * RAMP * x**4 * (2.5 + x * (-3.0 + x))  # its rate rises from 0 to `rate` with zero acceleration at both ends
+        return (
+            rate * RAMP * x**4 * (2.5 + x * (-3.0 + x))
+        )  # its rate rises from 0 to `rate` with zero acceleration at both ends
 
     h = 1e-4
     before, now, after = (path(phase(time + shift)) for shift in (-h, 0.0, h))
@@ -75,8 +78,10 @@ def test_closed_loop_runs_agree(path: Callable[[float], np.ndarray], rate: float
     slip_size = np.sqrt(np.mean(reduced_slip**2))
     slip_apart = np.sqrt(np.mean((bullet_slip - reduced_slip) ** 2))
     travelled = np.sum(np.hypot(*np.diff(reduced_pose[:, :2], axis=0).T))
-    print(f"\n{path.__name__}: {travelled:.1f} m, pose within {1e3 * apart.max():.3f} mm, slip {1e3 * slip_size:.2f} mm/s RMS, "
-          f"apart {100 * slip_apart / slip_size:.1f} %")
+    print(
+        f"\n{path.__name__}: {travelled:.1f} m, pose within {1e3 * apart.max():.3f} mm, slip {1e3 * slip_size:.2f} mm/s RMS, "
+        f"apart {100 * slip_apart / slip_size:.1f} %"
+    )
     assert travelled > 5.0
     assert apart.max() < 1e-3
     assert slip_apart < 0.2 * slip_size

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from pcw_description import load_robot
 from pcw_description.effects.effect import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER
@@ -20,7 +21,9 @@ def test_traction_test_measures_the_peak_friction(speed: float) -> None:
     robot = load_robot("thesis")
     plant = make_plant("pybullet", traction_rig(robot))
     try:
-        curve = measure_traction(plant, speed, np.array([0.08, 0.09, 0.1, 0.11, 0.12, 0.3]), settle=max(0.5, 0.5 / speed))
+        curve = measure_traction(
+            plant, speed, np.array([0.08, 0.09, 0.1, 0.11, 0.12, 0.3]), settle=max(0.5, 0.5 / speed)
+        )
     finally:
         plant.close()
     slip, friction = curve.peak
@@ -66,8 +69,12 @@ def test_follows_the_reduced_plant_in_open_loop() -> None:
         plant.close()
     reduced, bullet = states["reduced"], states["pybullet"]
     scale = np.abs(reduced.joint_velocity).max(axis=0)
-    np.testing.assert_allclose(bullet.joint_velocity / scale, reduced.joint_velocity / scale, atol=SUSPENSION_TOLERANCE)
-    np.testing.assert_allclose(bullet.twist, reduced.twist, atol=SUSPENSION_TOLERANCE * np.abs(reduced.twist).max())
+    np.testing.assert_allclose(
+        bullet.joint_velocity / scale, reduced.joint_velocity / scale, atol=SUSPENSION_TOLERANCE
+    )
+    np.testing.assert_allclose(
+        bullet.twist, reduced.twist, atol=SUSPENSION_TOLERANCE * np.abs(reduced.twist).max()
+    )
 
 
 def test_effects_act_as_in_the_reduced_plant() -> None:
@@ -76,7 +83,11 @@ def test_effects_act_as_in_the_reduced_plant() -> None:
     robot = dataclasses.replace(
         nominal,
         physics=(
-            EffectInstance("drive_coulomb_friction", ("rear_left",), {"coulomb": 1.0, "asymmetry": 0.0, "smoothing_speed": 0.05}),
+            EffectInstance(
+                "drive_coulomb_friction",
+                ("rear_left",),
+                {"coulomb": 1.0, "asymmetry": 0.0, "smoothing_speed": 0.05},
+            ),
             EffectInstance("payload_mass", ("chassis",), {"mass": 10.0, "x": 0.0, "y": 0.0, "z": 0.3}),
         ),
     )

@@ -5,6 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
+
 from pcw_description import AugmentedObjectModel, load_robot, parse_robot, shipped_robots
 from pcw_description.effects.effect import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription, robot_to_mapping
@@ -12,7 +13,9 @@ from pcw_sim_bridge.plants.plant import PlantError, make_plant
 from pcw_sim_bridge.plants.reduced import ReducedPlant
 from pcw_sim_bridge.traction_test import measure_traction, traction_rig
 
-TORQUE_ROBOTS = [name for name in shipped_robots() if np.all(np.abs(load_robot(name).caster_offset[:, 0]) > 1e-3)]
+TORQUE_ROBOTS = [
+    name for name in shipped_robots() if np.all(np.abs(load_robot(name).caster_offset[:, 0]) > 1e-3)
+]
 # The plant takes joint accelerations from one semi-implicit step; rounding of that difference sets the tolerance.
 ENGINE_TOLERANCE = 1e-7
 # Semi-implicit steps are of first order: their energy error per second and dt [1/s], measured at 0.4 with these motions.
@@ -31,9 +34,16 @@ def random_robot(rng: np.random.Generator, n: int) -> RobotDescription:
             | {
                 "name": f"caster{index}",
                 "steer_axis": [0.3 * np.cos(angle), 0.3 * np.sin(angle)],
-                "caster_offset": [float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.05)), float(rng.uniform(-0.01, 0.01))],
+                "caster_offset": [
+                    float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.05)),
+                    float(rng.uniform(-0.01, 0.01)),
+                ],
                 "gears": {"drive": 12.0, "steer": 15.0, "drive_per_steer": float(rng.uniform(-4, 4))},
-                "module": {"mass": float(rng.uniform(2, 5)), "com": rng.uniform(-0.03, 0.03, 2).tolist(), "inertia_zz": 0.05},
+                "module": {
+                    "mass": float(rng.uniform(2, 5)),
+                    "com": rng.uniform(-0.03, 0.03, 2).tolist(),
+                    "inertia_zz": 0.05,
+                },
             }
         )
     mapping["casters"] = casters
@@ -165,13 +175,19 @@ def kinetic_energy(robot: RobotDescription, state) -> float:  # type: ignore[no-
         return np.array([vx - omega * point[1], vy + omega * point[0]])
 
     chassis = robot.chassis
-    total = 0.5 * chassis.mass * np.sum(velocity(np.array(chassis.com[:2])) ** 2) + 0.5 * chassis.inertia_zz * omega**2
+    total = (
+        0.5 * chassis.mass * np.sum(velocity(np.array(chassis.com[:2])) ** 2)
+        + 0.5 * chassis.inertia_zz * omega**2
+    )
     for i, caster in enumerate(robot.casters):
         roll, steer = state.joint_velocity[i]
         c, s = np.cos(state.joint_position[i, STEER]), np.sin(state.joint_position[i, STEER])
         arm = np.array([[c, -s], [s, c]]) @ np.array(caster.module.com)
         at_com = velocity(np.array(caster.steer_axis)) + (steer + omega) * np.array([-arm[1], arm[0]])
-        total += 0.5 * caster.module.mass * np.sum(at_com**2) + 0.5 * caster.module.inertia_zz * (steer + omega) ** 2
+        total += (
+            0.5 * caster.module.mass * np.sum(at_com**2)
+            + 0.5 * caster.module.inertia_zz * (steer + omega) ** 2
+        )
         total += 0.5 * caster.wheel.inertia_axle * roll**2
         rates = np.array([roll, steer])
         total += 0.5 * rates @ robot.armature[i] @ rates
@@ -195,7 +211,9 @@ def test_power_balance() -> None:
     plant.reset(steer_angle=rng.uniform(-1, 1, 4))
     work = lost = 0.0
     for step in range(20000):
-        torque = np.column_stack([np.sin(2 * np.pi * 0.7 * step * dt + np.arange(4)), 0.5 * np.cos(5 * step * dt + np.arange(4))])
+        torque = np.column_stack(
+            [np.sin(2 * np.pi * 0.7 * step * dt + np.arange(4)), 0.5 * np.cos(5 * step * dt + np.arange(4))]
+        )
         before = plant.state()
         plant.step(torque)
         after = plant.state()
@@ -215,7 +233,9 @@ def test_coulomb_friction_slows_as_its_definition_says_and_holds_at_rest() -> No
         robot,
         physics=(
             EffectInstance(
-                "drive_coulomb_friction", robot.caster_names, {"coulomb": friction, "asymmetry": 0.0, "smoothing_speed": 0.05}
+                "drive_coulomb_friction",
+                robot.caster_names,
+                {"coulomb": friction, "asymmetry": 0.0, "smoothing_speed": 0.05},
             ),
         ),
     )

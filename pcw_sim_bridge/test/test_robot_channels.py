@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from pcw_description import RobotDescription, load_robot
 from pcw_description.effects.effect import EffectInstance
 from pcw_description.recording import Recording
@@ -18,7 +19,9 @@ DURATION = 16.0
 def wandering(time: float) -> np.ndarray:
     """Return a twist that moves all three axes at speeds of no common period."""
     ramp = min(time, 1.0)
-    return ramp * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
+    return ramp * np.array(
+        [0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)]
+    )
 
 
 def record(folder: Path, robot: RobotDescription, seed: int, plant: str = "reduced") -> Recording:
@@ -42,9 +45,16 @@ def column_fit(builder: RobotProblemBuilder, column: np.ndarray) -> tuple[float,
 @pytest.mark.parametrize("plant", ["reduced", "pybullet"])
 def test_a_healthy_robot_leaves_next_to_nothing(tmp_path: Path, plant: str) -> None:
     """Wrench residuals below 4 % of the wrench in the plane, below 12 % on springs that pitch."""
-    problem = RobotProblemBuilder(load_robot("thesis"), [record(tmp_path, load_robot("thesis"), 1, plant)]).build()
+    problem = RobotProblemBuilder(
+        load_robot("thesis"), [record(tmp_path, load_robot("thesis"), 1, plant)]
+    ).build()
     assert [channel.name for channel in problem.channels] == [
-        "chassis_force/x", "chassis_force/y", "chassis_torque/z", "gyro", "accelerometer/x", "accelerometer/y",
+        "chassis_force/x",
+        "chassis_force/y",
+        "chassis_torque/z",
+        "gyro",
+        "accelerometer/x",
+        "accelerometer/y",
     ]
     assert problem.valid.mean() > 0.85
     residual = np.sqrt(np.mean(np.where(problem.valid, problem.residual, 0.0) ** 2, axis=0))
@@ -56,7 +66,9 @@ def test_a_healthy_robot_leaves_next_to_nothing(tmp_path: Path, plant: str) -> N
 def test_a_changed_number_is_its_nuisance(tmp_path: Path) -> None:
     """3 kg more chassis and a wheel heading read 20 mrad wrong come out with their size, through their own columns."""
     nominal = load_robot("thesis")
-    heavier = dataclasses.replace(nominal, chassis=dataclasses.replace(nominal.chassis, mass=nominal.chassis.mass + 3.0))
+    heavier = dataclasses.replace(
+        nominal, chassis=dataclasses.replace(nominal.chassis, mass=nominal.chassis.mass + 3.0)
+    )
     builder = RobotProblemBuilder(nominal, [record(tmp_path, heavier, 2)])
     columns = {nuisance.name: nuisance.column for nuisance in builder.build().nuisances}
     coefficient, explained = column_fit(builder, columns["chassis.mass"])
@@ -76,8 +88,12 @@ def test_a_changed_number_is_its_nuisance(tmp_path: Path) -> None:
 def test_an_effect_is_its_own_column(tmp_path: Path, plant: str) -> None:
     """Coulomb friction on one drive: its column gives the torque within 5 %, those of the other drives explain less."""
     nominal = load_robot("thesis")
-    friction = EffectInstance("drive_coulomb_friction", ("rear_right",), {"coulomb": 0.6, "asymmetry": 0.0, "smoothing_speed": 0.05})
-    builder = RobotProblemBuilder(nominal, [record(tmp_path, dataclasses.replace(nominal, physics=(friction,)), 3, plant)])
+    friction = EffectInstance(
+        "drive_coulomb_friction", ("rear_right",), {"coulomb": 0.6, "asymmetry": 0.0, "smoothing_speed": 0.05}
+    )
+    builder = RobotProblemBuilder(
+        nominal, [record(tmp_path, dataclasses.replace(nominal, physics=(friction,)), 3, plant)]
+    )
     problem = builder.build()
     explained = {}
     for index, term in enumerate(problem.terms):
@@ -93,7 +109,9 @@ def test_an_effect_is_its_own_column(tmp_path: Path, plant: str) -> None:
 def test_an_effect_that_the_description_holds_is_not_left_over(tmp_path: Path) -> None:
     """With the friction in the robot file the residual is that of a healthy robot again: a patched file is nominal."""
     nominal = load_robot("thesis")
-    friction = EffectInstance("drive_coulomb_friction", ("rear_right",), {"coulomb": 0.6, "asymmetry": 0.0, "smoothing_speed": 0.05})
+    friction = EffectInstance(
+        "drive_coulomb_friction", ("rear_right",), {"coulomb": 0.6, "asymmetry": 0.0, "smoothing_speed": 0.05}
+    )
     patched = dataclasses.replace(nominal, physics=(friction,))
     recording = record(tmp_path, patched, 4)
     before = RobotProblemBuilder(nominal, [recording]).build()
@@ -107,7 +125,8 @@ def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path:
     recording = record(tmp_path, load_robot("thesis"), 5)
     swerve = load_robot("thesis")
     swerve = dataclasses.replace(
-        swerve, casters=tuple(dataclasses.replace(caster, caster_offset=(0.0, 0.0)) for caster in swerve.casters)
+        swerve,
+        casters=tuple(dataclasses.replace(caster, caster_offset=(0.0, 0.0)) for caster in swerve.casters),
     )
     problem = RobotProblemBuilder(swerve, [recording]).build()
     assert [channel.name for channel in problem.channels] == ["gyro", "accelerometer/x", "accelerometer/y"]

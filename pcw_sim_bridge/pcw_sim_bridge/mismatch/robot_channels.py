@@ -24,6 +24,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
+
 from pcw_description.augmented_object_model import dynamic_parameters
 from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import forward_kinematics_kernel
@@ -94,11 +95,22 @@ class ModelNumbers:
         chassis, modules = dynamic_parameters(robot)
         imu = robot.sensors.imu
         return cls(
-            chassis=chassis, modules=modules, com_height=robot.chassis.com[2], steer_axis=robot.steer_axis.copy(),
-            caster_offset=robot.caster_offset.copy(), radius=robot.wheel_radius.copy(), steer_zero=np.zeros(robot.n),
-            gain=np.ones((robot.n, 2)), imu_position=np.array(imu.position[:2]) if imu else np.zeros(2), gyro_bias=0.0,
-            gyro_scale=1.0, accelerometer_bias=np.zeros(2), slip=1.0, critical_slip=robot.contact.lambda_p,
-            peak_friction=robot.contact.mu_p, relaxation_length=robot.contact.relaxation_length,
+            chassis=chassis,
+            modules=modules,
+            com_height=robot.chassis.com[2],
+            steer_axis=robot.steer_axis.copy(),
+            caster_offset=robot.caster_offset.copy(),
+            radius=robot.wheel_radius.copy(),
+            steer_zero=np.zeros(robot.n),
+            gain=np.ones((robot.n, 2)),
+            imu_position=np.array(imu.position[:2]) if imu else np.zeros(2),
+            gyro_bias=0.0,
+            gyro_scale=1.0,
+            accelerometer_bias=np.zeros(2),
+            slip=1.0,
+            critical_slip=robot.contact.lambda_p,
+            peak_friction=robot.contact.mu_p,
+            relaxation_length=robot.contact.relaxation_length,
             torque_lag=0.0,
         )
 
@@ -133,13 +145,17 @@ def _twists(steer_axis, caster_offset, radius, steer_angle, velocity):  # type: 
     twist = np.empty((count, 3))
     slip = np.empty(count)
     for t in range(count):
-        twist[t], residual, _ = forward_kinematics_kernel(steer_axis, caster_offset, radius, steer_angle[t], velocity[t])
+        twist[t], residual, _ = forward_kinematics_kernel(
+            steer_axis, caster_offset, radius, steer_angle[t], velocity[t]
+        )
         slip[t] = np.sqrt(np.max(residual[:, 0] ** 2 + residual[:, 1] ** 2))
     return twist, slip
 
 
 @compiled
-def _contact_forces(modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, twist, twist_dot):  # type: ignore[no-untyped-def]
+def _contact_forces(
+    modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, twist, twist_dot
+):  # type: ignore[no-untyped-def]
     """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N]."""
     force = np.empty_like(torque)
     for t in range(len(torque)):
@@ -151,12 +167,32 @@ def _contact_forces(modules, steer_axis, caster_offset, radius, steer_angle, vel
             sx, sy = steer_axis[i, 0], steer_axis[i, 1]
             sigma = velocity[t, i, 1] + omega
             sigma_dot = acceleration[t, i, 1] + twist_dot[t, 2]
-            ax = twist_dot[t, 0] - omega * vy - twist_dot[t, 2] * sy - omega * omega * sx - sigma_dot * lever_y - sigma * sigma * lever_x
-            ay = twist_dot[t, 1] + omega * vx + twist_dot[t, 2] * sx - omega * omega * sy + sigma_dot * lever_x - sigma * sigma * lever_y
+            ax = (
+                twist_dot[t, 0]
+                - omega * vy
+                - twist_dot[t, 2] * sy
+                - omega * omega * sx
+                - sigma_dot * lever_y
+                - sigma * sigma * lever_x
+            )
+            ay = (
+                twist_dot[t, 1]
+                + omega * vx
+                + twist_dot[t, 2] * sx
+                - omega * omega * sy
+                + sigma_dot * lever_x
+                - sigma * sigma * lever_y
+            )
             roll_inertia = modules[i, 4] + modules[i, 5]
-            along = (torque[t, i, 0] - roll_inertia * acceleration[t, i, 0] - modules[i, 6] * acceleration[t, i, 1]) / radius[i]
+            along = (
+                torque[t, i, 0] - roll_inertia * acceleration[t, i, 0] - modules[i, 6] * acceleration[t, i, 1]
+            ) / radius[i]
             turning = m * (lever_x * ay - lever_y * ax) + modules[i, 3] * sigma_dot
-            turning += modules[i, 7] * acceleration[t, i, 1] + modules[i, 6] * acceleration[t, i, 0] - torque[t, i, 1]
+            turning += (
+                modules[i, 7] * acceleration[t, i, 1]
+                + modules[i, 6] * acceleration[t, i, 0]
+                - torque[t, i, 1]
+            )
             force[t, i, 0] = along
             force[t, i, 1] = (turning + caster_offset[i, 1] * along) / caster_offset[i, 0]
     return force
@@ -181,7 +217,9 @@ def _wrench_of(steer_axis, caster_offset, steer_angle, force):  # type: ignore[n
 
 
 @compiled
-def _inertial_wrench(chassis, modules, steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot):  # type: ignore[no-untyped-def]
+def _inertial_wrench(
+    chassis, modules, steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
+):  # type: ignore[no-untyped-def]
     """Wrench (T, 3) that accelerates chassis and modules as they move; rotors and rolling wheels are not in it."""
     wrench = np.empty_like(twist)
     for t in range(len(twist)):
@@ -227,7 +265,14 @@ def normal_forces(numbers: ModelNumbers, steer_angle: FloatArray, acceleration: 
     centre = (chassis[0] * chassis[1:3] + (modules[:, :1] * numbers.steer_axis).sum(axis=0)) / mass
     height = (chassis[0] * numbers.com_height + (modules[:, 0] * numbers.radius).sum()) / mass
     forces: FloatArray = _normal_forces(
-        mass, centre[0], centre[1], height, numbers.steer_axis, numbers.caster_offset, steer_angle, acceleration
+        mass,
+        centre[0],
+        centre[1],
+        height,
+        numbers.steer_axis,
+        numbers.caster_offset,
+        steer_angle,
+        acceleration,
     )
     return forces
 
@@ -235,7 +280,9 @@ def normal_forces(numbers: ModelNumbers, steer_angle: FloatArray, acceleration: 
 class RobotProblemBuilder:
     """Builds the regression problem of a robot from its recordings."""
 
-    def __init__(self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None) -> None:
+    def __init__(
+        self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None
+    ) -> None:
         """Filter the recordings.
 
         Args:
@@ -301,9 +348,16 @@ class RobotProblemBuilder:
                 sensed = np.where(np.isfinite(block[:, 4 * n :]), smooth[:, 4 * n :], np.nan)
                 self.motions.append(
                     RobotMotion(
-                        recording=index, rate=rate / step, sampling=1.0 / rate, time=stamps[start:stop][keep], position=position[keep].copy(),
-                        velocity=velocity[keep].copy(), acceleration=derivative(velocity, rate)[keep].copy(),
-                        torque=torque[keep].copy(), torque_rate=derivative(torque, rate)[keep].copy(), imu=sensed[keep],
+                        recording=index,
+                        rate=rate / step,
+                        sampling=1.0 / rate,
+                        time=stamps[start:stop][keep],
+                        position=position[keep].copy(),
+                        velocity=velocity[keep].copy(),
+                        acceleration=derivative(velocity, rate)[keep].copy(),
+                        torque=torque[keep].copy(),
+                        torque_rate=derivative(torque, rate)[keep].copy(),
+                        imu=sensed[keep],
                     )
                 )
 
@@ -311,7 +365,9 @@ class RobotProblemBuilder:
 
     def channels(self) -> tuple[Channel, ...]:
         """Channels that these recordings can fill."""
-        names = [Channel(name, "N m" if "torque" in name else "N") for name in WRENCH] if self.balanced else []
+        names = (
+            [Channel(name, "N m" if "torque" in name else "N") for name in WRENCH] if self.balanced else []
+        )
         if self.has_imu:
             names.append(Channel("gyro", "rad/s", axis="imu"))
             names += [Channel(f"accelerometer/{axis}", "m/s^2", axis="imu") for axis in "xy"]
@@ -333,7 +389,14 @@ class RobotProblemBuilder:
             if added_torque is not None:
                 torque = torque + added_torque
             force = _contact_forces(
-                numbers.modules, *geometry, numbers.radius, steer_angle, motion.velocity, motion.acceleration, torque, twist,
+                numbers.modules,
+                *geometry,
+                numbers.radius,
+                steer_angle,
+                motion.velocity,
+                motion.acceleration,
+                torque,
+                twist,
                 derivative(twist, motion.rate),
             )
             twist = twist - self._slip_twist(motion, numbers, steer_angle, twist, force)
@@ -341,9 +404,14 @@ class RobotProblemBuilder:
             measured.append(_wrench_of(*geometry, steer_angle, force))
             predicted.append(
                 _inertial_wrench(
-                    numbers.chassis, numbers.modules, numbers.steer_axis, steer_angle,
-                    np.ascontiguousarray(motion.velocity[:, :, STEER]), np.ascontiguousarray(motion.acceleration[:, :, STEER]),
-                    twist, twist_dot,
+                    numbers.chassis,
+                    numbers.modules,
+                    numbers.steer_axis,
+                    steer_angle,
+                    np.ascontiguousarray(motion.velocity[:, :, STEER]),
+                    np.ascontiguousarray(motion.acceleration[:, :, STEER]),
+                    twist,
+                    twist_dot,
                 )
             )
         else:
@@ -356,8 +424,16 @@ class RobotProblemBuilder:
                 np.stack(
                     [
                         numbers.gyro_scale * omega + numbers.gyro_bias,
-                        twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x + numbers.accelerometer_bias[0],
-                        twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y + numbers.accelerometer_bias[1],
+                        twist_dot[:, 0]
+                        - omega * twist[:, 1]
+                        - alpha * y
+                        - omega**2 * x
+                        + numbers.accelerometer_bias[0],
+                        twist_dot[:, 1]
+                        + omega * twist[:, 0]
+                        + alpha * x
+                        - omega**2 * y
+                        + numbers.accelerometer_bias[1],
                     ],
                     axis=1,
                 )
@@ -365,7 +441,12 @@ class RobotProblemBuilder:
         return np.concatenate(measured, axis=1), np.concatenate(predicted, axis=1)
 
     def _slip_twist(
-        self, motion: RobotMotion, numbers: ModelNumbers, steer_angle: FloatArray, twist: FloatArray, force: FloatArray
+        self,
+        motion: RobotMotion,
+        numbers: ModelNumbers,
+        steer_angle: FloatArray,
+        twist: FloatArray,
+        force: FloatArray,
     ) -> FloatArray:
         """Twist (T, 3) that the wheels show beyond the robot's: A^+ of the slip that carries the contact forces.
 
@@ -378,14 +459,19 @@ class RobotProblemBuilder:
         use = np.clip(force / (numbers.peak_friction * normal[:, :, None]), -0.99, 0.99)
         ratio = numbers.slip * numbers.critical_slip * use / (1.0 + np.sqrt(1.0 - use**2))
         rolling = np.hypot(
-            motion.velocity[:, :, DRIVE] * numbers.radius, motion.velocity[:, :, STEER] * numbers.caster_offset[:, 0]
+            motion.velocity[:, :, DRIVE] * numbers.radius,
+            motion.velocity[:, :, STEER] * numbers.caster_offset[:, 0],
         )
         slip = rolling[:, :, None] * ratio + numbers.relaxation_length * derivative(ratio, motion.rate)
         # A^+ of slips is A^+ B of the joint rates that would look like them.
         as_rates = np.empty_like(slip)
         as_rates[:, :, STEER] = slip[:, :, 1] / -numbers.caster_offset[:, 0]
-        as_rates[:, :, DRIVE] = (slip[:, :, 0] - numbers.caster_offset[:, 1] * as_rates[:, :, STEER]) / numbers.radius
-        slip_twist, _ = _twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, as_rates)
+        as_rates[:, :, DRIVE] = (
+            slip[:, :, 0] - numbers.caster_offset[:, 1] * as_rates[:, :, STEER]
+        ) / numbers.radius
+        slip_twist, _ = _twists(
+            numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, as_rates
+        )
         result: FloatArray = slip_twist
         return result
 
@@ -403,10 +489,15 @@ class RobotProblemBuilder:
             channels=self.channels(),
             time=np.concatenate(stamps),
             segment=np.concatenate([np.full(len(t), i) for i, t in enumerate(stamps)]),
-            recording=np.concatenate([np.full(len(t), m.recording) for t, m in zip(stamps, self.motions, strict=True)]),
+            recording=np.concatenate(
+                [np.full(len(t), m.recording) for t, m in zip(stamps, self.motions, strict=True)]
+            ),
             rate=float(np.mean([f.decimated_rate for f in self.filters])),
-            measured=measured, residual=residual, valid=valid,
-            nuisances=tuple(self._nuisances(sides)), terms=tuple(self._terms(sides, measured)),
+            measured=measured,
+            residual=residual,
+            valid=valid,
+            nuisances=tuple(self._nuisances(sides)),
+            terms=tuple(self._terms(sides, measured)),
             variables=self._variables(),
         )
 
@@ -419,20 +510,28 @@ class RobotProblemBuilder:
         numbers = self.numbers
         for motion, (measured, _) in zip(self.motions, sides, strict=True):
             steer_angle = np.ascontiguousarray(motion.position[:, :, STEER])
-            twist, slip = _twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, motion.velocity)
-            speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * np.max(np.linalg.norm(numbers.steer_axis, axis=1))
+            twist, slip = _twists(
+                numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, motion.velocity
+            )
+            speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * np.max(
+                np.linalg.norm(numbers.steer_axis, axis=1)
+            )
             bad = slip > SLIP_FLOOR + SLIP_FRACTION * speed
             if self.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
             pieces.append(bad[:, None] | ~np.isfinite(measured))
         return self._filtered([piece.astype(float) for piece in pieces]) < 0.1
 
-    def _difference(self, sides: Sequence[tuple[FloatArray, FloatArray]], numbers: ModelNumbers, step: float) -> FloatArray:
+    def _difference(
+        self, sides: Sequence[tuple[FloatArray, FloatArray]], numbers: ModelNumbers, step: float
+    ) -> FloatArray:
         """Column (T, C) of a number: what the residual of the nominal model holds per unit of its deviation."""
         pieces = []
         for motion, (measured, predicted) in zip(self.motions, sides, strict=True):
             changed_measured, changed_predicted = self._sides(motion, numbers)
-            pieces.append(np.nan_to_num(((measured - predicted) - (changed_measured - changed_predicted)) / step))
+            pieces.append(
+                np.nan_to_num(((measured - predicted) - (changed_measured - changed_predicted)) / step)
+            )
         return self._filtered(pieces)
 
     def _nuisances(self, sides: Sequence[tuple[FloatArray, FloatArray]]) -> list[Nuisance]:
@@ -449,13 +548,17 @@ class RobotProblemBuilder:
         robot = self.robot
         found: list[tuple[str, str, float, float, Callable[[ModelNumbers, float], None]]] = []
 
-        def number(tolerance: str, label: str, nominal: float, vary: Callable[[ModelNumbers, float], None]) -> None:
+        def number(
+            tolerance: str, label: str, nominal: float, vary: Callable[[ModelNumbers, float], None]
+        ) -> None:
             known = robot.tolerance(tolerance)
             deviation = known.value * abs(nominal) if known.relative else known.value
             if deviation > 0.0:
                 found.append((label, known.unit, nominal, deviation, vary))
 
-        def entry(array: str, index: int | tuple[int, ...] | tuple[slice, int]) -> Callable[[ModelNumbers, float], None]:
+        def entry(
+            array: str, index: int | tuple[int, ...] | tuple[slice, int]
+        ) -> Callable[[ModelNumbers, float], None]:
             def vary(numbers: ModelNumbers, step: float) -> None:
                 getattr(numbers, array)[index] += step
 
@@ -480,8 +583,18 @@ class RobotProblemBuilder:
             number("chassis.com", "chassis.com.y", 0.0, entry("chassis", 2))
             number("chassis.inertia_zz", "chassis.inertia_zz", robot.chassis.inertia_zz, entry("chassis", 3))
             number("module.mass", "module.mass", first.module.mass, scaled("modules", 0, first.module.mass))
-            number("module.inertia_zz", "module.inertia_zz", first.module.inertia_zz, scaled("modules", 3, first.module.inertia_zz))
-            number("wheel.inertia_axle", "wheel.inertia_axle", first.wheel.inertia_axle, scaled("modules", 4, first.wheel.inertia_axle))
+            number(
+                "module.inertia_zz",
+                "module.inertia_zz",
+                first.module.inertia_zz,
+                scaled("modules", 3, first.module.inertia_zz),
+            )
+            number(
+                "wheel.inertia_axle",
+                "wheel.inertia_axle",
+                first.wheel.inertia_axle,
+                scaled("modules", 4, first.wheel.inertia_axle),
+            )
             for axis, column in (("drive", 5), ("steer", 7)):
                 inertia = float(self.numbers.modules[0, column])
                 if inertia > 0.0:
@@ -492,7 +605,12 @@ class RobotProblemBuilder:
             if self.balanced:
                 number("caster_offset", f"caster_offset.x/{caster.name}", 0.0, entry("caster_offset", (i, 0)))
                 for axis, axis_name in enumerate(AXIS_NAMES):
-                    number("torque_constant", f"torque_constant/{caster.name}_{axis_name}", 1.0, entry("gain", (i, axis)))
+                    number(
+                        "torque_constant",
+                        f"torque_constant/{caster.name}_{axis_name}",
+                        1.0,
+                        entry("gain", (i, axis)),
+                    )
         if self.has_imu:
 
             def scale(numbers: ModelNumbers, step: float) -> None:
@@ -504,7 +622,12 @@ class RobotProblemBuilder:
             number("imu.scale", "imu.gyro_scale", 1.0, scale)
             number("imu.gyro_bias", "imu.gyro_bias", 0.0, bias)
             for k, axis_name in enumerate("xy"):
-                number("imu.accelerometer_bias", f"imu.accelerometer_bias.{axis_name}", 0.0, entry("accelerometer_bias", k))
+                number(
+                    "imu.accelerometer_bias",
+                    f"imu.accelerometer_bias.{axis_name}",
+                    0.0,
+                    entry("accelerometer_bias", k),
+                )
                 number("imu.position", f"imu.position.{axis_name}", 0.0, entry("imu_position", k))
             if self.balanced:
 
@@ -532,13 +655,23 @@ class RobotProblemBuilder:
         names = [parameter.name for parameter in effect.linear_parameters]
         pieces = []
         # Small against the weight, so that the tyres' curves stay straight.
-        scales = [1e-2 * self.robot.total_mass * float(np.mean(self.numbers.radius)) / self._torque_size(effect, name, shape) for name in names]
+        scales = [
+            1e-2
+            * self.robot.total_mass
+            * float(np.mean(self.numbers.radius))
+            / self._torque_size(effect, name, shape)
+            for name in names
+        ]
         for motion, normal, nominal in zip(self.motions, self._normal, self._nominal, strict=True):
             columns = np.zeros((len(motion.time), width, len(names)))
             torques = np.zeros((len(names), len(motion.time), self.robot.n, 2))
             for i in casters:
                 by_name = effect.regressor(
-                    motion.position[:, i, axis], motion.velocity[:, i, axis], motion.torque[:, i, axis], normal[:, i], shape
+                    motion.position[:, i, axis],
+                    motion.velocity[:, i, axis],
+                    motion.torque[:, i, axis],
+                    normal[:, i],
+                    shape,
                 )
                 for k, name in enumerate(names):
                     torques[k, :, i, axis] = by_name[name]
@@ -555,7 +688,11 @@ class RobotProblemBuilder:
         axis = AXIS_NAMES.index(effect.axis)
         motion, normal = self.motions[0], self._normal[0]
         column = effect.regressor(
-            motion.position[:, 0, axis], motion.velocity[:, 0, axis], motion.torque[:, 0, axis], normal[:, 0], shape
+            motion.position[:, 0, axis],
+            motion.velocity[:, 0, axis],
+            motion.torque[:, 0, axis],
+            normal[:, 0],
+            shape,
         )[name]
         return max(float(np.sqrt(np.mean(column**2))), 1e-9)
 
@@ -567,7 +704,9 @@ class RobotProblemBuilder:
             numbers = self.numbers
             for motion in self.motions:
                 angle = np.ascontiguousarray(motion.position[:, :, STEER])
-                twist, _ = _twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
+                twist, _ = _twists(
+                    numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity
+                )
                 twist_dot = derivative(twist, motion.rate)
                 acceleration = twist_dot[:, :2] + twist[:, 2:] * np.stack([-twist[:, 1], twist[:, 0]], axis=1)
                 self._normal_cache.append(normal_forces(numbers, angle, acceleration))
@@ -575,7 +714,9 @@ class RobotProblemBuilder:
 
     def _known_effects(self, width: int) -> FloatArray:
         """What effects that the description already holds add to the residual, (T, C)."""
-        total = np.zeros((sum(len(f.decimate(m.time)) for f, m in zip(self.filters, self.motions, strict=True)), width))
+        total = np.zeros(
+            (sum(len(f.decimate(m.time)) for f, m in zip(self.filters, self.motions, strict=True)), width)
+        )
         for instance in self.robot.physics:
             effect = all_effects()[instance.name]
             if self.balanced and isinstance(effect, JointTorqueEffect):
@@ -613,54 +754,94 @@ class RobotProblemBuilder:
             if parameter.default is not None:
                 shapes = [{**shape, parameter.name: parameter.default} for shape in shapes]
             elif parameter.unit == "rad/s":
-                shapes = [{**shape, parameter.name: float(v)} for shape in shapes for v in np.geomspace(0.05, 0.5, 4) * top]
+                shapes = [
+                    {**shape, parameter.name: float(v)}
+                    for shape in shapes
+                    for v in np.geomspace(0.05, 0.5, 4) * top
+                ]
             else:
                 return None
         return tuple(shapes)
 
     def _joint_term(
-        self, effect: JointTorqueEffect, target: tuple[str, ...], casters: list[int], shapes: tuple[dict[str, float], ...], size: float
+        self,
+        effect: JointTorqueEffect,
+        target: tuple[str, ...],
+        casters: list[int],
+        shapes: tuple[dict[str, float], ...],
+        size: float,
     ) -> Term:
         def columns(shape: Shape) -> FloatArray:
             return self._joint_columns(effect, casters, shape)
 
         first = columns(shapes[0])
-        variable = {"position": "angle", "velocity": "velocity", "force": "torque", "normal_force": "normal_force"}
+        variable = {
+            "position": "angle",
+            "velocity": "velocity",
+            "force": "torque",
+            "normal_force": "normal_force",
+        }
         parameters = []
         for k, parameter in enumerate(effect.linear_parameters):
             scale = float(np.sqrt(np.mean(first[:, :3, k] ** 2)))
             parameters.append(
                 LinearParameter(
-                    parameter.name, parameter.unit, parameter.lower, parameter.upper, size / max(scale, 1e-12),
+                    parameter.name,
+                    parameter.unit,
+                    parameter.lower,
+                    parameter.upper,
+                    size / max(scale, 1e-12),
                     refinement=parameter.name == "asymmetry",
                 )
             )
         return Term(
-            effect=effect.name, target=target, parameters=tuple(parameters), shapes=shapes, columns=columns,
+            effect=effect.name,
+            target=target,
+            parameters=tuple(parameters),
+            shapes=shapes,
+            columns=columns,
             arguments=tuple(
-                f"{effect.axis}_{variable[argument]}/{name}" for argument in kernel_arguments(effect.name) for name in target
+                f"{effect.axis}_{variable[argument]}/{name}"
+                for argument in kernel_arguments(effect.name)
+                for name in target
             ),
             resolution={p.name: ("log", 2.15) for p in effect.nonlinear_parameters if p.default is None},
         )
 
-    def _description_term(self, effect: DescriptionEffect, sides: Sequence[tuple[FloatArray, FloatArray]]) -> Term:
+    def _description_term(
+        self, effect: DescriptionEffect, sides: Sequence[tuple[FloatArray, FloatArray]]
+    ) -> Term:
         """A change of the description's numbers, linear in its first parameter for given shaping ones."""
         linear = effect.linear_parameters[0]
         reach = np.max(np.abs(self.robot.steer_axis), axis=0)
-        places = [{"x": x * float(reach[0]), "y": y * float(reach[1])} for x in (-0.7, 0.0, 0.7) for y in (-0.7, 0.0, 0.7)]
+        places = [
+            {"x": x * float(reach[0]), "y": y * float(reach[1])}
+            for x in (-0.7, 0.0, 0.7)
+            for y in (-0.7, 0.0, 0.7)
+        ]
         defaults = {p.name: p.default for p in effect.nonlinear_parameters if p.default is not None}
         free = {p.name for p in effect.nonlinear_parameters}
         shapes = tuple({**defaults, **{k: v for k, v in place.items() if k in free}} for place in places)
 
         def columns(shape: Shape) -> FloatArray:
             step = 0.1 * linear.typical
-            robot = effect.apply(self._with_nominal_changes(self.robot), (effect.target_kind,), {**shape, linear.name: step})
+            robot = effect.apply(
+                self._with_nominal_changes(self.robot), (effect.target_kind,), {**shape, linear.name: step}
+            )
             return self._difference(sides, ModelNumbers.of(robot), step)[:, :, None]
 
         return Term(
-            effect=effect.name, target=(effect.target_kind,), shapes=shapes, columns=columns, arguments=("acceleration",),
-            parameters=(LinearParameter(linear.name, linear.unit, linear.lower, linear.upper, 3.0 * linear.typical),),
-            resolution={name: ("linear", 0.35 * float(reach[k])) for k, name in enumerate("xy") if name in free},
+            effect=effect.name,
+            target=(effect.target_kind,),
+            shapes=shapes,
+            columns=columns,
+            arguments=("acceleration",),
+            parameters=(
+                LinearParameter(linear.name, linear.unit, linear.lower, linear.upper, 3.0 * linear.typical),
+            ),
+            resolution={
+                name: ("linear", 0.35 * float(reach[k])) for k, name in enumerate("xy") if name in free
+            },
         )
 
     def _variables(self) -> dict[str, FloatArray]:
@@ -673,7 +854,9 @@ class RobotProblemBuilder:
 
         for filter_, motion, normal in zip(self.filters, self.motions, self._normal, strict=True):
             angle = np.ascontiguousarray(motion.position[:, :, STEER])
-            twist, _ = _twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
+            twist, _ = _twists(
+                numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity
+            )
             variables.setdefault("time", []).append(filter_.decimate(motion.time))
             put("speed", filter_, np.hypot(twist[:, 0], twist[:, 1]))
             for k, name in enumerate(("v_x", "v_y", "omega")):
@@ -683,8 +866,16 @@ class RobotProblemBuilder:
                 put(f"drive_angle/{caster}", filter_, np.ascontiguousarray(motion.position[:, i, DRIVE]))
                 put(f"drive_normal_force/{caster}", filter_, np.ascontiguousarray(normal[:, i]))
                 for axis, axis_name in enumerate(AXIS_NAMES):
-                    put(f"{axis_name}_velocity/{caster}", filter_, np.ascontiguousarray(motion.velocity[:, i, axis]))
-                    put(f"{axis_name}_torque/{caster}", filter_, np.ascontiguousarray(motion.torque[:, i, axis]))
+                    put(
+                        f"{axis_name}_velocity/{caster}",
+                        filter_,
+                        np.ascontiguousarray(motion.velocity[:, i, axis]),
+                    )
+                    put(
+                        f"{axis_name}_torque/{caster}",
+                        filter_,
+                        np.ascontiguousarray(motion.torque[:, i, axis]),
+                    )
         return {name: np.concatenate(parts) for name, parts in variables.items()}
 
 
@@ -710,7 +901,9 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
                 continue
             angle = angle[usable]
             noise = white_noise_level(angle)
-            acceleration = derivative(derivative(slow.smooth(angle), rate), rate)[slow.settling : -slow.settling]
+            acceleration = derivative(derivative(slow.smooth(angle), rate), rate)[
+                slow.settling : -slow.settling
+            ]
             allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(acceleration)), 1e-3)
             if noise > 0.0:
                 cutoffs.append((allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from pcw_description.contact.contact_model import TYRE_SIZE, tyre_parameters
 from pcw_description.robot_description import FloatArray, RobotDescription
 

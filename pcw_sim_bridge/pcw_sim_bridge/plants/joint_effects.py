@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from pcw_description.compiled import compiled, joint_torque_list
 from pcw_description.effects.effect import JointTorqueEffect
 from pcw_description.effects.registry import get

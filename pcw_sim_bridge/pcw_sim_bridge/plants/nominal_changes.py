@@ -21,5 +21,7 @@ def as_it_really_is(robot: RobotDescription) -> RobotDescription:
         if isinstance(effect, DescriptionEffect):
             changed = effect.apply(changed, instance.target, instance.parameters)
         elif not isinstance(effect, JointTorqueEffect):
-            raise PlantError(f"physics: the plants cannot produce {instance.name!r} ({type(effect).__name__}) yet")
+            raise PlantError(
+                f"physics: the plants cannot produce {instance.name!r} ({type(effect).__name__}) yet"
+            )
     return changed

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pybullet
+
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 from pcw_description.urdf import robot_urdf
 
@@ -58,7 +59,9 @@ class PybulletPlant:
     def __init__(self, robot: RobotDescription, dt: float = 1e-3, gui: bool = False) -> None:
         robot.require_torque_control()
         if robot.n < 3:
-            raise PlantError(f"{robot.name} has {robot.n} casters; the PyBullet plant needs at least 3 to stand (use the reduced plant)")
+            raise PlantError(
+                f"{robot.name} has {robot.n} casters; the PyBullet plant needs at least 3 to stand (use the reduced plant)"
+            )
         self.robot = robot
         self.dt = dt
         self._true_robot = as_it_really_is(robot)
@@ -92,11 +95,20 @@ class PybulletPlant:
         # Bullet's own damping, speed limit and holding motors are not physics of this robot.
         for link in range(-1, len(indices)):
             pybullet.changeDynamics(
-                self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, maxJointVelocity=1e4,
+                self._body,
+                link,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
+                maxJointVelocity=1e4,
                 physicsClientId=client,
             )
         pybullet.setJointMotorControlArray(
-            self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(self._joints), physicsClientId=client
+            self._body,
+            self._joints,
+            pybullet.VELOCITY_CONTROL,
+            forces=[0.0] * len(self._joints),
+            physicsClientId=client,
         )
         # Reflected rotors: a URDF may not hold them, because no rigid body has such inertias.
         for i in range(robot.n):
@@ -106,7 +118,9 @@ class PybulletPlant:
             ):
                 diagonal = list(pybullet.getDynamicsInfo(self._body, link, physicsClientId=client)[2])
                 diagonal[component] += inertia
-                pybullet.changeDynamics(self._body, link, localInertiaDiagonal=diagonal, physicsClientId=client)
+                pybullet.changeDynamics(
+                    self._body, link, localInertiaDiagonal=diagonal, physicsClientId=client
+                )
         self._com_in_base = np.array(robot.chassis.com)
 
     def reset(self, pose: FloatArray | None = None, steer_angle: FloatArray | None = None) -> None:
@@ -133,16 +147,24 @@ class PybulletPlant:
         self._yaw = float(start[2])
         self._time = 0.0
 
-    def _place(self, pose: FloatArray, headings: FloatArray, height: float, tilt: tuple[float, float]) -> None:
+    def _place(
+        self, pose: FloatArray, headings: FloatArray, height: float, tilt: tuple[float, float]
+    ) -> None:
         client = self._client
         quaternion = pybullet.getQuaternionFromEuler([tilt[0], tilt[1], float(pose[2])])
         origin = np.array([pose[0], pose[1], height])
         position = origin + rotation_matrix(np.array(quaternion)) @ self._com_in_base
-        pybullet.resetBasePositionAndOrientation(self._body, position.tolist(), quaternion, physicsClientId=client)
+        pybullet.resetBasePositionAndOrientation(
+            self._body, position.tolist(), quaternion, physicsClientId=client
+        )
         pybullet.resetBaseVelocity(self._body, [0.0] * 3, [0.0] * 3, physicsClientId=client)
         for i, heading in enumerate(headings):
-            pybullet.resetJointState(self._body, self._joints[2 * i + DRIVE], 0.0, 0.0, physicsClientId=client)
-            pybullet.resetJointState(self._body, self._joints[2 * i + STEER], float(heading), 0.0, physicsClientId=client)
+            pybullet.resetJointState(
+                self._body, self._joints[2 * i + DRIVE], 0.0, 0.0, physicsClientId=client
+            )
+            pybullet.resetJointState(
+                self._body, self._joints[2 * i + STEER], float(heading), 0.0, physicsClientId=client
+            )
         self._read()
 
     def _read(self) -> None:
@@ -161,16 +183,35 @@ class PybulletPlant:
         linear, angular = self._velocity
         before = self._wheels[:, RHO_DOT : PHI_DOT + 1].copy()
         wrench, joint_torque = contact_wrench(
-            self.dt, self._casters, self._effects.kernels, self._effects.place, self._effects.numbers, self._suspension,
-            self._armature, command, np.array(quaternion), np.array(position), np.array(linear), np.array(angular),
-            self._com_in_base, self._joint_acceleration, self._acceleration[2], self._wheels,
+            self.dt,
+            self._casters,
+            self._effects.kernels,
+            self._effects.place,
+            self._effects.numbers,
+            self._suspension,
+            self._armature,
+            command,
+            np.array(quaternion),
+            np.array(position),
+            np.array(linear),
+            np.array(angular),
+            self._com_in_base,
+            self._joint_acceleration,
+            self._acceleration[2],
+            self._wheels,
         )
         pybullet.applyExternalForce(
             self._body, -1, wrench[:3].tolist(), position, pybullet.WORLD_FRAME, physicsClientId=client
         )
-        pybullet.applyExternalTorque(self._body, -1, wrench[3:].tolist(), pybullet.WORLD_FRAME, physicsClientId=client)
+        pybullet.applyExternalTorque(
+            self._body, -1, wrench[3:].tolist(), pybullet.WORLD_FRAME, physicsClientId=client
+        )
         pybullet.setJointMotorControlArray(
-            self._body, self._joints, pybullet.TORQUE_CONTROL, forces=joint_torque.ravel().tolist(), physicsClientId=client
+            self._body,
+            self._joints,
+            pybullet.TORQUE_CONTROL,
+            forces=joint_torque.ravel().tolist(),
+            physicsClientId=client,
         )
         pybullet.stepSimulation(physicsClientId=client)
         self._read()
@@ -207,7 +248,12 @@ class PybulletPlant:
         c, s = math.cos(yaw), math.sin(yaw)
         to_base = np.array([[c, s], [-s, c]])
         yaw_acceleration, yaw_rate = self._acceleration[2], angular[2]
-        spin = np.array([-yaw_acceleration * arm[1] - yaw_rate**2 * arm[0], yaw_acceleration * arm[0] - yaw_rate**2 * arm[1]])
+        spin = np.array(
+            [
+                -yaw_acceleration * arm[1] - yaw_rate**2 * arm[0],
+                yaw_acceleration * arm[0] - yaw_rate**2 * arm[1],
+            ]
+        )
         wheels = self._wheels
         return PlantState(
             time=self._time,

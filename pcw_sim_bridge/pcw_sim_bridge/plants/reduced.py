@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import scrub_torque, tyre_step
 from pcw_description.robot_description import FloatArray, RobotDescription
@@ -99,7 +100,9 @@ def support_forces(mass, com_x, com_y, com_z, acc_x, acc_y, centre, normal_force
 
 
 @compiled
-def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_numbers, command, body, wheels):  # type: ignore[no-untyped-def]
+def _advance(
+    steps, dt, chassis, casters, effect_kernels, effect_place, effect_numbers, command, body, wheels
+):  # type: ignore[no-untyped-def]
     """Advance body (9,) and wheels (n, 13) in place by `steps` steps with the motor torques command (n, 2) held.
 
     Returns False, and changes nothing, if a torque is not finite.
@@ -134,7 +137,14 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
             com_y += casters[i, MASS] * (casters[i, SY] + casters[i, CX] * s + casters[i, CY] * c)
             com_z += casters[i, MASS] * casters[i, RADIUS]
         support_forces(
-            total_mass, com_x / total_mass, com_y / total_mass, com_z / total_mass, body[_AX], body[_AY], centre, normal
+            total_mass,
+            com_x / total_mass,
+            com_y / total_mass,
+            com_z / total_mass,
+            body[_AX],
+            body[_AY],
+            centre,
+            normal,
         )
         for i in range(n):
             c, s = math.cos(wheels[i, PHI]), math.sin(wheels[i, PHI])
@@ -149,7 +159,9 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
             slip_x, slip_y = radius * rho_dot - along, -across
             speed = max(abs(radius * rho_dot), math.sqrt(along * along + across * across))
             tyre = casters[i, TYRE:]
-            zx, zy, fx, fy = tyre_step(tyre, wheels[i, ZX], wheels[i, ZY], slip_x, slip_y, speed, normal[i], dt)
+            zx, zy, fx, fy = tyre_step(
+                tyre, wheels[i, ZX], wheels[i, ZY], slip_x, slip_y, speed, normal[i], dt
+            )
             spin = scrub_torque(tyre, sigma, speed, normal[i])
             wheels[i, ZX], wheels[i, ZY] = zx, zy
             wheels[i, SLIP_X], wheels[i, SLIP_Y] = slip_x, slip_y
@@ -199,7 +211,9 @@ def _advance(steps, dt, chassis, casters, effect_kernels, effect_place, effect_n
                         inertia_pp += dt * slope
             determinant = inertia_rr * inertia_pp - inertia_rp * inertia_rp
             inverse[i, 0], inverse[i, 1], inverse[i, 2] = (
-                inertia_pp / determinant, -inertia_rp / determinant, inertia_rr / determinant,
+                inertia_pp / determinant,
+                -inertia_rp / determinant,
+                inertia_rr / determinant,
             )
             drive_rhs[i], steer_rhs[i] = rhs_r, rhs_p
             # Schur complement: what the caster takes from the body.
@@ -250,7 +264,9 @@ class ReducedPlant:
         self.dt = dt
         true_robot = as_it_really_is(robot)
         chassis = true_robot.chassis
-        self._chassis = np.array([chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2]])
+        self._chassis = np.array(
+            [chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2]]
+        )
         self._casters = caster_numbers(true_robot)
         self._effects = JointEffects(robot)
         self._body = np.zeros(9)
@@ -275,8 +291,16 @@ class ReducedPlant:
             PlantError: a torque is NaN or infinite; the plant has not moved.
         """
         if not _advance(
-            steps, self.dt, self._chassis, self._casters, self._effects.kernels, self._effects.place, self._effects.numbers,
-            motor_torque, self._body, self._wheels,
+            steps,
+            self.dt,
+            self._chassis,
+            self._casters,
+            self._effects.kernels,
+            self._effects.place,
+            self._effects.numbers,
+            motor_torque,
+            self._body,
+            self._wheels,
         ):
             raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
         self._time += steps * self.dt

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import scrub_torque, tyre_step
 
@@ -62,9 +63,21 @@ def rotation_matrix(quaternion):  # type: ignore[no-untyped-def]
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     matrix = np.empty((3, 3))
-    matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    matrix[2, 0], matrix[2, 1], matrix[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+    )
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = (
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+    )
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = (
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
+    )
     return matrix
 
 
@@ -136,17 +149,26 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         contact = arm - radius * radial
         # Velocities of the wheel centre and of the tread at the contact.
         turning = angular_velocity + row[PHI_DOT] * axis
-        centre_velocity = com_velocity + _cross(angular_velocity, arm) + row[PHI_DOT] * _cross(axis, from_axis)
+        centre_velocity = (
+            com_velocity + _cross(angular_velocity, arm) + row[PHI_DOT] * _cross(axis, from_axis)
+        )
         tread_velocity = centre_velocity + _cross(turning + row[RHO_DOT] * axle, contact - arm)
         penetration = -(com_position[2] + contact[2])
-        normal = max(suspension[0] * penetration - suspension[1] * tread_velocity[2], 0.0) if penetration > 0.0 else 0.0
+        normal = (
+            max(suspension[0] * penetration - suspension[1] * tread_velocity[2], 0.0)
+            if penetration > 0.0
+            else 0.0
+        )
         slip_x = -(tread_velocity[0] * forward[0] + tread_velocity[1] * forward[1])
         slip_y = -(tread_velocity[0] * across[0] + tread_velocity[1] * across[1])
         speed = max(
-            abs(radius * row[RHO_DOT]), math.sqrt(centre_velocity[0] * centre_velocity[0] + centre_velocity[1] * centre_velocity[1])
+            abs(radius * row[RHO_DOT]),
+            math.sqrt(centre_velocity[0] * centre_velocity[0] + centre_velocity[1] * centre_velocity[1]),
         )
         tyre = casters[i, TYRE:]
-        row[ZX], row[ZY], force_x, force_y = tyre_step(tyre, row[ZX], row[ZY], slip_x, slip_y, speed, normal, dt)
+        row[ZX], row[ZY], force_x, force_y = tyre_step(
+            tyre, row[ZX], row[ZY], slip_x, slip_y, speed, normal, dt
+        )
         spin = scrub_torque(tyre, turning[2], speed, normal)
         row[SLIP_X], row[SLIP_Y], row[FX], row[FY], row[FZ] = slip_x, slip_y, force_x, force_y, normal
         force = force_x * forward + force_y * across + normal * up
@@ -166,8 +188,12 @@ def contact_wrench(  # type: ignore[no-untyped-def]
     for k in range(len(effect_place)):
         i, along = effect_place[k, 0], effect_place[k, 1]
         torque, slope = joint_effect_torque(
-            effect_kernels[k], wheels[i, RHO + along], wheels[i, RHO_DOT + along], wheels[i, MOTOR_RHO + along],
-            wheels[i, FZ], effect_numbers[k],
+            effect_kernels[k],
+            wheels[i, RHO + along],
+            wheels[i, RHO_DOT + along],
+            wheels[i, MOTOR_RHO + along],
+            wheels[i, FZ],
+            effect_numbers[k],
         )
         # The engine steps explicitly: limit the torque to what an implicit step would apply.
         joint_torque[i, along] += torque / (1.0 + dt * slope / _joint_inertia(casters[i], along))
