@@ -59,9 +59,8 @@ def measure_traction(
 ) -> TractionCurve:
     """Drive a `traction_rig` straight at `speed` and bring its first wheel to each slip ratio in turn.
 
-    The wheel under test is speed controlled to the true speed / (1 - lambda); the others keep the robot's speed, all headings
-    are
-    held at zero.
+    The wheel under test is speed controlled to the true speed / (1 - lambda); the others keep the robot's speed, all
+    headings are held at zero.
 
     Args:
         plant: the plant; it is reset.

@@ -36,7 +36,7 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDes
 from ..plants.reduced import support_forces
 from .axis_channels import kernel_arguments
 from .errors import MismatchError
-from .regression_problem import Channel, FloatArray, LinearParameter, Nuisance, RegressionProblem, Shape, Term
+from .regression_problem import BoolArray, Channel, FloatArray, LinearParameter, Nuisance, RegressionProblem, Shape, Term
 from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
 
 LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
@@ -153,9 +153,9 @@ def _twists(steer_axis, caster_offset, radius, steer_angle, velocity):  # type: 
 
 
 @compiled
-def _contact_forces(
+def _contact_forces(  # type: ignore[no-untyped-def]
     modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, twist, twist_dot
-):  # type: ignore[no-untyped-def]
+):
     """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N]."""
     force = np.empty_like(torque)
     for t in range(len(torque)):
@@ -217,9 +217,9 @@ def _wrench_of(steer_axis, caster_offset, steer_angle, force):  # type: ignore[n
 
 
 @compiled
-def _inertial_wrench(
+def _inertial_wrench(  # type: ignore[no-untyped-def]
     chassis, modules, steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
-):  # type: ignore[no-untyped-def]
+):
     """Wrench (T, 3) that accelerates chassis and modules as they move; rotors and rolling wheels are not in it."""
     wrench = np.empty_like(twist)
     for t in range(len(twist)):
@@ -336,7 +336,7 @@ class RobotProblemBuilder:
         for stamps, values in pieces:
             needed = 4 * n if self.balanced else 2 * n
             finite = np.isfinite(values[:, :needed]).all(axis=1)
-            for start, stop in _runs(finite):
+            for start, stop in _runs(np.asarray(finite, dtype=bool)):
                 if stamps[stop - 1] - stamps[start] < SHORTEST_SEGMENT:
                     continue
                 block = values[start:stop]
@@ -504,7 +504,7 @@ class RobotProblemBuilder:
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         return np.concatenate([f.apply(piece) for f, piece in zip(self.filters, pieces, strict=True)])
 
-    def _valid(self, sides: Sequence[tuple[FloatArray, FloatArray]]) -> np.ndarray:
+    def _valid(self, sides: Sequence[tuple[FloatArray, FloatArray]]) -> BoolArray:
         """Samples (T, C) that the rolling model can judge: moving, no gross slip, sensor there."""
         pieces = []
         numbers = self.numbers
@@ -595,10 +595,10 @@ class RobotProblemBuilder:
                 first.wheel.inertia_axle,
                 scaled("modules", 4, first.wheel.inertia_axle),
             )
-            for axis, column in (("drive", 5), ("steer", 7)):
+            for rotor, column in (("drive", 5), ("steer", 7)):
                 inertia = float(self.numbers.modules[0, column])
                 if inertia > 0.0:
-                    number("rotors", f"rotors.{axis}", inertia, scaled("modules", column, inertia))
+                    number("rotors", f"rotors.{rotor}", inertia, scaled("modules", column, inertia))
         for i, caster in enumerate(robot.casters):
             number("wheel_radius", f"wheel_radius/{caster.name}", caster.wheel_radius, self._radius(i))
             number("steer_zero", f"steer_zero/{caster.name}", 0.0, entry("steer_zero", i))
@@ -730,7 +730,7 @@ class RobotProblemBuilder:
         if not self.balanced:
             return []
         terms = []
-        groups = [((name,), [i]) for i, name in enumerate(self.robot.caster_names)]
+        groups: list[tuple[tuple[str, ...], list[int]]] = [((name,), [i]) for i, name in enumerate(self.robot.caster_names)]
         groups.append((self.robot.caster_names, list(range(self.robot.n))))
         size = np.sqrt(np.mean(measured[:, :3] ** 2))
         for effect in all_effects().values():
@@ -910,7 +910,7 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
     return max(min(cutoffs), SMALLEST_CUTOFF)
 
 
-def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+def _runs(flags: BoolArray) -> list[tuple[int, int]]:
     """Start and stop of every run of true values."""
     edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

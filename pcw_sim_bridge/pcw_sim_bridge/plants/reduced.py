@@ -100,9 +100,9 @@ def support_forces(mass, com_x, com_y, com_z, acc_x, acc_y, centre, normal_force
 
 
 @compiled
-def _advance(
+def _advance(  # type: ignore[no-untyped-def]
     steps, dt, chassis, casters, effect_kernels, effect_place, effect_numbers, command, body, wheels
-):  # type: ignore[no-untyped-def]
+):
     """Advance body (9,) and wheels (n, 13) in place by `steps` steps with the motor torques command (n, 2) held.
 
     Returns False, and changes nothing, if a torque is not finite.
