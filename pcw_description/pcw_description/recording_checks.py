@@ -239,19 +239,23 @@ def axes_in_degrees(robot: RobotDescription, position: FloatArray, velocity: Flo
 def _rolling_residual(
     robot: RobotDescription, casters: npt.NDArray[np.intp], angle: FloatArray, rate: FloatArray
 ) -> float:
-    """Share (0 .. 1) of the wheel-centre velocities that no motion of the base explains; angle (T, n), rate (T, n, 2)."""
+    """Wheel-centre velocities that no motion of the base explains, relative to those sensed, as mean squares.
+
+    Along and across the wheels are weighed alike, so that fast rolling does not hide a contradiction with slow steering.
+    Arguments: angle (T, n), rate (T, n, 2).
+    """
     axis, offset = robot.steer_axis[casters], robot.caster_offset[casters]
     radius = robot.wheel_radius[casters]
     # velocity of each wheel centre in its own frame, B q_dot of (3.22)
     along = rate[:, :, DRIVE] * radius + rate[:, :, STEER] * offset[:, 1]
     across = -rate[:, :, STEER] * offset[:, 0]
-    total = float(np.sum(along**2 + across**2))
-    if total == 0.0:
+    sensed = np.array([np.sum(along**2), np.sum(across**2)])
+    if not sensed.any():
         return 1.0
-    slip = [
-        forward_kinematics_kernel(axis, offset, radius, angle[row], rate[row])[1] for row in range(len(angle))
-    ]
-    return float(np.sum(np.square(slip))) / total
+    # a wheel without offset senses nothing across
+    sensed = np.maximum(sensed, 1e-3 * sensed.max())
+    slip = np.array([forward_kinematics_kernel(axis, offset, radius, angle[row], rate[row])[1] for row in range(len(angle))])
+    return float(np.mean(np.sum(slip**2, axis=(0, 1)) / sensed))
 
 
 def spans_text(stamp: FloatArray, rows: Sequence[int] | npt.NDArray[np.intp], most: int = 5) -> str:

@@ -20,6 +20,8 @@ POSITION, VELOCITY, EFFORT = range(3)
 UNMEASURED_SHARE = 0.5
 # So few messages without some joints are dropped; more of them are used as they are.
 FEW = 0.05
+# A joint whose position has changed by more has moved [rad].
+MOVED = 0.1
 
 
 def read_joint_series(
@@ -50,6 +52,7 @@ def read_joint_series(
     stamp = (stamp_ns - (stamp_ns[0] if t0_ns is None else t0_ns)) * 1e-9
     table.warn_of_gaps(stamp)
     if measured:
+        _leave_out_idle_velocities(table, joints, values)
         _warn_of_missing_fields(table, joints, values)
         correct_units(stamp, names, robot, values[POSITION], values[VELOCITY], table.warn)
     else:
@@ -115,11 +118,25 @@ def _warn_of_missing_joints(table: MessageTable, joints: _JointTable, robot: Rob
 
 def _warn_of_missing_fields(table: MessageTable, joints: _JointTable, values: FloatArray) -> None:
     for kind, name in enumerate(FIELDS):
-        absent = joints.ever_present & ~np.isfinite(values[kind]).any(axis=0)
+        absent = joints.ever_present & ~np.isfinite(joints.values[kind]).any(axis=0)
         if count := int(absent.sum()):
             everywhere = count == joints.ever_present.sum()
             which = "any joint" if everywhere else list_names(np.array(joints.names)[absent])
             table.warn("missing_field", f"no {name} of {which} was measured; it is NaN", count)
+
+
+def _leave_out_idle_velocities(table: MessageTable, joints: _JointTable, values: FloatArray) -> None:
+    """Some drivers send zeros for what they do not measure; in place, on values (3, T, m)."""
+    idle = [
+        column
+        for column in np.flatnonzero(joints.ever_present)
+        if not values[VELOCITY, :, column].any() and np.ptp(values[POSITION, :, column]) > MOVED
+    ]
+    if idle:
+        values[VELOCITY][:, idle] = np.nan
+        which = list_names(np.array(joints.names)[idle])
+        text = f"the velocity of {which} is 0 throughout although the position moves: not measured; it is left out (NaN)"
+        table.warn("missing_field", text, len(idle))
 
 
 # --- From messages to one stream ------------------------------------------------------------------------

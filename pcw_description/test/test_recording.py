@@ -21,6 +21,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Reader as RosbagsReader
 from rosbags.rosbag2 import Writer as RosbagsWriter
@@ -459,6 +460,25 @@ def test_bags_of_rosbag2_are_read_in_every_storage(
         assert len(Recording.open(file, robot).joint_states) == 300
 
 
+def test_a_file_without_chunks_is_read(robot: RobotDescription, tmp_path: Path) -> None:
+    """rosbag2's `fastwrite` preset writes no chunks, and a kill cuts the last message in two."""
+    path = tmp_path / "fastwrite.mcap"
+    writer = McapWriter(str(path), use_chunking=False)
+    writer.start(profile="ros2")
+    definition = ros_messages.message_definition(ros_messages.JOINT_STATE) or ""
+    schema = writer.register_schema(ros_messages.JOINT_STATE, "ros2msg", definition.encode())
+    channel = writer.register_channel("/joint_states", "cdr", schema)
+    for row in range(100):
+        data = ros_messages.serialise(joint_state(T0 + row * SECOND, robot.joint_names, np.full((robot.n, 2), row / 7)))
+        writer.add_message(channel, T0 + row * SECOND, data, T0 + row * SECOND)
+    writer.finish()
+    assert len(Recording.open(path, robot).joint_states) == 100
+    whole = path.read_bytes()
+    last = whole.rindex(data)
+    path.write_bytes(whole[: last + 40])
+    assert len(Recording.open(path, robot).joint_states) == 99
+
+
 def test_a_damaged_database_is_read_as_far_as_it_goes(robot: RobotDescription, tmp_path: Path) -> None:
     short = drive(robot).keep(np.arange(2000))
     with RosbagsWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
@@ -792,6 +812,17 @@ def test_an_empty_field_was_not_measured(robot: RobotDescription, tmp_path: Path
     assert np.isnan(recording.joint_states.velocity).all()
 
 
+def test_zeros_for_a_velocity_that_nobody_measures_are_left_out(robot: RobotDescription, tmp_path: Path) -> None:
+    spoilt = drive(robot)
+    spoilt.velocity[:, :, STEER] = 0.0
+    recording = Recording.open(spoilt.write(tmp_path / "bag"), robot)
+    text = text_of(recording, "missing_field")
+    assert text.startswith("joint_states: the velocity of front_left_steer, front_right_steer, rear_left_steer")
+    assert text.endswith("is 0 throughout although the position moves: not measured; it is left out (NaN)")
+    assert np.isnan(recording.joint_states.velocity[:, :, STEER]).all()
+    np.testing.assert_array_equal(recording.joint_states.velocity[:, :, DRIVE], spoilt.velocity[:, :, DRIVE])
+
+
 def test_arrays_of_another_length_than_the_names_are_damaged(robot: RobotDescription, tmp_path: Path) -> None:
     path = tmp_path / "bag"
     healthy = drive(robot).keep(np.arange(300))
@@ -937,7 +968,7 @@ def test_wrong_units_are_named_and_converted(
     np.testing.assert_allclose(states.velocity, healthy.velocity, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("axes", [(STEER,), (DRIVE, STEER)], ids=["steer", "both"])
+@pytest.mark.parametrize("axes", [(STEER,), (DRIVE,), (DRIVE, STEER)], ids=["steer", "drive", "both"])
 @pytest.mark.parametrize("seed", range(3))
 def test_degrees_throughout_are_found_by_rolling(
     robot: RobotDescription, tmp_path: Path, axes: tuple[int, ...], seed: int
@@ -951,7 +982,9 @@ def test_degrees_throughout_are_found_by_rolling(
     recording = Recording.open(spoilt.write(tmp_path / "bag"), robot)
     texts = [str(warning) for warning in recording.warnings if warning.code == "wrong_unit"]
     assert len(texts) == len(axes)
-    assert any("the steer joints are in degrees and degrees/s: read so, the wheels roll together" in text for text in texts)
+    for axis, text in zip(axes, texts):
+        joints = "the drive joints" if axis == DRIVE else "the steer joints"
+        assert f"{joints} are in degrees and degrees/s: read so, the wheels roll together" in text
     np.testing.assert_allclose(recording.joint_states.position, healthy.position, rtol=1e-12, atol=1e-12)
 
 

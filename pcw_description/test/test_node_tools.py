@@ -1,0 +1,226 @@
+"""What every node shares: parameters that are refused with a reason, stamps, joint states without NaN, an orderly end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from rclpy.context import Context  # noqa: E402
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from pcw_description.errors import PcwError  # noqa: E402
+from pcw_description.nodes.node_tools import (  # noqa: E402
+    StampWatch,
+    declare,
+    fill_joint_state,
+    joint_state_arrays,
+    ns_to_stamp,
+    stamp_to_ns,
+)
+
+DOMAIN = 1 + os.getpid() % 100
+DEADLINE = 60.0
+
+
+@pytest.fixture(scope="module")
+def context() -> Iterator[Context]:
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        context = Context()
+        rclpy.init(context=context, domain_id=DOMAIN)
+        yield context
+        rclpy.try_shutdown(context=context)
+
+
+def make_node(context: Context, **overrides: object) -> Node:
+    parameters = [Parameter(name, value=value) for name, value in overrides.items()]
+    return Node("test_node_tools", context=context, parameter_overrides=parameters, start_parameter_services=False)
+
+
+# --- Parameters -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("rate", 2000.0, "out of range"),
+        ("rate", float("nan"), "out of range"),
+        ("rate", 5, "Wrong parameter type"),
+        ("free", float("inf"), "free: inf is not a finite number"),
+        ("count", 9, "out of range"),
+        ("mode", "fats", "mode: 'fats' is not known; did you mean 'fast'?"),
+        ("gains", [1.0, 9.0], "gains: 9.0 is outside 0.0 .. 5.0 1/s"),
+        ("gains", [1.0, float("nan")], "gains: nan is not a finite number"),
+        ("even", 3, "even: 3 is odd"),
+        ("fixed", 2.0, "read-only"),
+    ],
+)
+def test_a_bad_value_is_refused_with_a_reason_and_the_old_one_stays(
+    context: Context, name: str, value: object, reason: str
+) -> None:
+    node = make_node(context)
+    declare(node, "rate", 100.0, "how often", unit="Hz", range=(1.0, 1000.0))
+    declare(node, "free", 1.0, "any number")
+    declare(node, "count", 3, "how many", range=(1, 5))
+    declare(node, "mode", "slow", "how", choices=("slow", "fast"))
+    declare(node, "gains", [1.0, 2.0], "gains", unit="1/s", range=(0.0, 5.0))
+    declare(node, "even", 2, "an even number", check=lambda number: "3 is odd" if number % 2 else None)
+    declare(node, "fixed", 1.0, "set once", read_only=True)
+    before = node.get_parameter(name).value
+    (result,) = node.set_parameters([Parameter(name, value=value)])
+    assert not result.successful
+    assert reason in result.reason
+    assert node.get_parameter(name).value == before
+    (result,) = node.set_parameters([Parameter("rate", value=200.0)])
+    assert result.successful and node.get_parameter("rate").value == 200.0
+    node.destroy_node()
+
+
+def test_descriptors_say_unit_and_range(context: Context) -> None:
+    node = make_node(context)
+    declare(node, "rate", 100.0, "how often", unit="Hz", range=(1.0, 1000.0))
+    declare(node, "mode", "slow", "how", choices=("slow", "fast"), read_only=True)
+    rate, mode = node.describe_parameters(["rate", "mode"])
+    assert rate.description == "how often [Hz]" and not rate.read_only
+    assert (rate.floating_point_range[0].from_value, rate.floating_point_range[0].to_value) == (1.0, 1000.0)
+    assert mode.additional_constraints == "one of slow, fast" and mode.read_only
+    node.destroy_node()
+
+
+def test_overrides_are_taken_or_refused_when_declared(context: Context) -> None:
+    node = make_node(context, rate=50.0, names=["a"], mode="fats", count=1.0)
+    assert declare(node, "rate", 100.0, "how often") == 50.0
+    assert declare(node, "names", Parameter.Type.STRING_ARRAY, "names") == ["a"]
+    assert declare(node, "others", Parameter.Type.STRING_ARRAY, "names") == []
+    with pytest.raises(InvalidParameterValueException, match="did you mean 'fast'"):
+        declare(node, "mode", "slow", "how", choices=("slow", "fast"))
+    with pytest.raises(InvalidParameterTypeException, match="expecting type 'INTEGER'"):
+        declare(node, "count", 1, "how many")
+    node.destroy_node()
+
+
+# --- Stamps and joint states ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("nanoseconds", [0, 1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789, -1])
+def test_stamps_are_exact_both_ways(nanoseconds: int) -> None:
+    assert stamp_to_ns(ns_to_stamp(nanoseconds)) == nanoseconds
+
+
+def test_a_stamp_watch_measures_and_counts() -> None:
+    watch = StampWatch(longest_gap=0.5)
+    steps = [watch.update(ns_to_stamp(int(t * 1e9))) for t in (1.0, 1.25, 1.25, 1.5, 1.0, 1.125, 3.0, 3.25)]
+    assert steps == [None, 0.25, None, 0.25, None, 0.125, None, 0.25]
+    assert (watch.repeats, watch.backward_jumps, watch.gaps) == (1, 1, 1)
+
+
+def test_joint_states_are_filled_in_order_and_nan_never_leaves() -> None:
+    message = JointState(name=["a_drive", "a_steer", "b_drive", "b_steer"])
+    position = np.array([[1.0, 2.0], [3.0, 4.0]])
+    broken = np.array([[1.0, np.nan], [3.0, 4.0]])
+    # a transposed array lies otherwise in memory, and must not come out otherwise
+    assert fill_joint_state(message, position, broken, np.asfortranarray(position)) == ("velocity",)
+    assert list(message.position) == [1.0, 2.0, 3.0, 4.0] == list(message.effort)
+    assert list(message.velocity) == []
+    assert fill_joint_state(message, effort=-position) == ()
+    assert list(message.position) == [] and list(message.effort) == [-1.0, -2.0, -3.0, -4.0]
+    with pytest.raises(PcwError, match="position: 3 values for 4 names"):
+        fill_joint_state(message, [1.0, 2.0, 3.0])
+
+
+def test_joint_states_are_read_by_name() -> None:
+    message = JointState(name=["b_steer", "gripper", "a_drive"], position=[4.0, 9.0, 1.0], effort=[0.4, 0.9, 0.1])
+    index = {"a_drive": 0, "a_steer": 1, "b_drive": 2, "b_steer": 3}
+    position, velocity, effort = joint_state_arrays(message, index, (2, 2))
+    np.testing.assert_array_equal(position, [[1.0, np.nan], [np.nan, 4.0]])
+    np.testing.assert_array_equal(effort, [[0.1, np.nan], [np.nan, 0.4]])
+    assert np.isnan(velocity).all()
+
+
+# --- Running --------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import sys
+from pcw_description.errors import PcwError
+from pcw_description.nodes.node_tools import declare, run_node
+from rclpy.node import Node
+from std_msgs.msg import String
+
+class Probe(Node):
+    def __init__(self):
+        super().__init__("probe")
+        kind = declare(self, "kind", "runs", "what to do")
+        self.finished = False
+        self.words = self.create_publisher(String, "words", 10)
+        if kind == "bad input":
+            raise PcwError("robot.yaml: mass is negative")
+        self.create_timer(0.01, lambda: self.work(kind))
+
+    def work(self, kind):
+        if kind == "breaks":
+            raise RuntimeError("broken on purpose")
+        if kind == "ends":
+            self.finished = True
+        print("working", flush=True)
+
+    def close(self):
+        self.words.publish(String(data="last words"))
+        print("closed", flush=True)
+
+sys.exit(run_node(Probe))
+"""
+
+
+def start_probe(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "--ros-args", *arguments],
+        env={**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(DOMAIN)},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        cwd=Path(__file__).parent,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_node_in_order(number: signal.Signals) -> None:
+    """It can still publish in close(), and the exit code is 0; a Ctrl-C delivered twice changes nothing."""
+    process = start_probe("-p", "knd:=typo")
+    assert process.stdout is not None and process.stdout.readline() == "working\n"
+    process.send_signal(number)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=DEADLINE)
+    assert process.returncode == 0, errors
+    assert output.endswith("closed\n")
+    assert "Traceback" not in errors
+    assert "parameter 'knd' is unknown to this node and ignored; did you mean 'kind'?" in errors
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "said", "closed"),
+    [
+        ("ends", 0, "", True),
+        ("breaks", 1, "broken on purpose", True),
+        ("bad input", 2, "robot.yaml: mass is negative\n", False),
+    ],
+)
+def test_exit_codes(kind: str, code: int, said: str, closed: bool) -> None:
+    process = start_probe("-p", f"kind:={kind}")
+    output, errors = process.communicate(timeout=DEADLINE)
+    assert process.returncode == code, errors
+    assert said in errors
+    assert ("Traceback" in errors) == (code == 1)
+    assert output.endswith("closed\n") == closed
