@@ -110,13 +110,13 @@ class Encoders:
 
 def read_imu(imu: ImuDescription, truth: PlantState, rng: np.random.Generator) -> ImuReading:
     """Return one reading of the IMU; the plants are planar in what they report, so roll and pitch are zero."""
-    r = np.array(imu.position)
-    omega = np.array([0.0, 0.0, truth.twist[2]])
-    alpha = np.array([0.0, 0.0, truth.acceleration[2]])
-    a_0 = np.array([truth.acceleration[0], truth.acceleration[1], STANDARD_GRAVITY])
-    acceleration = a_0 + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
+    r_x, r_y, _ = imu.position
+    a_x, a_y, alpha = truth.acceleration
+    omega = truth.twist[2]
+    # a_0 + alpha x r + omega x (omega x r), written out: np.cross is slow on single vectors.
+    acceleration = np.array([a_x - alpha * r_y - omega**2 * r_x, a_y + alpha * r_x - omega**2 * r_y, STANDARD_GRAVITY])
     return ImuReading(
-        angular_velocity=omega + imu.gyro_noise * rng.standard_normal(3),
+        angular_velocity=np.array([0.0, 0.0, omega]) + imu.gyro_noise * rng.standard_normal(3),
         linear_acceleration=acceleration + imu.accelerometer_noise * rng.standard_normal(3),
     )
 

@@ -236,11 +236,14 @@ class PybulletPlant:
     def state(self) -> PlantState:
         """Return the truth now; the pose is that of base_link's origin, seen from above."""
         position, quaternion = self._base
-        linear, angular = (np.array(vector) for vector in self._velocity)
+        linear, angular = self._velocity
         rotation = rotation_matrix(np.array(quaternion))
         arm = -rotation @ self._com_in_base
         origin = np.array(position) + arm
-        velocity = linear + np.cross(angular, arm)
+        # Of linear + angular x arm the horizontal part; np.cross is slow on single vectors.
+        velocity = np.array(
+            [linear[0] + angular[1] * arm[2] - angular[2] * arm[1], linear[1] + angular[2] * arm[0] - angular[0] * arm[2]]
+        )
         heading = math.atan2(rotation[1, 0], rotation[0, 0])
         # The engine's yaw is wrapped; the integrated rate says which turn it is.
         yaw = heading + 2.0 * math.pi * round((self._yaw - heading) / (2.0 * math.pi))
@@ -258,7 +261,7 @@ class PybulletPlant:
         return PlantState(
             time=self._time,
             pose=np.array([origin[0], origin[1], yaw]),
-            twist=np.array([*(to_base @ velocity[:2]), yaw_rate]),
+            twist=np.array([*(to_base @ velocity), yaw_rate]),
             acceleration=np.array([*(to_base @ (self._acceleration[:2] + spin)), yaw_acceleration]),
             joint_position=wheels[:, RHO : PHI + 1].copy(),
             joint_velocity=wheels[:, RHO_DOT : PHI_DOT + 1].copy(),
