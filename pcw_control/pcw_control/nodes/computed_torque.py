@@ -15,7 +15,7 @@ from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot, odometry
-from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Status
+from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import (
     COMMAND,
     SENSOR,
@@ -67,7 +67,7 @@ class ComputedTorqueNode(LifecycleNode):
         self._message = JointState(name=list(robot.joint_names))
         self._active = False
         self._faults = self._timeouts = self._refused = 0
-        self._last_problem = ""
+        self._problems = Problems(self)
         self._fault = ""
         self._adopt_parameters()
         self.add_post_set_parameters_callback(lambda _: self._adopt_parameters())
@@ -207,7 +207,7 @@ class ComputedTorqueNode(LifecycleNode):
         if self._now_ns - self._twist_ns > self._cmd_vel_timeout * 1e9:
             self._twist = None
             self._timeouts += 1
-            self._problem("no cmd_vel within cmd_vel_timeout; the torque is zero")
+            self._problems.add("no cmd_vel within cmd_vel_timeout; the torque is zero")
             return None
         return TwistReference(self._twist)
 
@@ -229,7 +229,7 @@ class ComputedTorqueNode(LifecycleNode):
             self._control(message, dt)
         except PcwError as error:
             self._faults += 1
-            self._problem(str(error))
+            self._problems.add(str(error))
             self._disengage()
         except Exception as error:
             self._fault = f"{type(error).__name__}: {error}"
@@ -270,31 +270,26 @@ class ComputedTorqueNode(LifecycleNode):
         if self._active and self._engaged and time.monotonic() - self._heard > self._joint_states_timeout:
             self._timeouts += 1
             self._twist, self._trajectory = None, None
-            self._problem("no joint_states within joint_states_timeout; the torque is zero")
+            self._problems.add("no joint_states within joint_states_timeout; the torque is zero")
             self._disengage()
 
     # --- Diagnostics ------------------------------------------------------------------------------------
 
     def _refuse(self, what: str) -> None:
         self._refused += 1
-        self._problem(f"refused: {what}")
-
-    def _problem(self, text: str) -> None:
-        if text != self._last_problem:
-            self.get_logger().warning(text)
-        self._last_problem = text
+        self._problems.add(f"refused: {what}")
 
     def _status(self) -> Status:
+        problems = self._problems.take()
         if not self._active:
             level, message = OK, "not active"
         elif self._fault:
             level, message = ERROR, f"latched: {self._fault}"
-        elif self._last_problem:
-            level, message = WARN, self._last_problem
+        elif problems:
+            level, message = WARN, problems
         else:
             following = "a trajectory" if self._trajectory is not None else "cmd_vel" if self._engaged else "nothing"
             level, message = OK, f"following {following}"
-        self._last_problem = ""
         return Status(
             level, message,
             {

@@ -21,6 +21,28 @@ class Status:
     values: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
 
+class Problems:
+    """What went wrong since the last report: logged once, reported once, however often it happens."""
+
+    def __init__(self, node: Node) -> None:
+        self._logger = node.get_logger()
+        self._current: dict[str, None] = {}  # a set that keeps its order
+        self._reported: dict[str, None] = {}
+
+    def add(self, text: str) -> bool:
+        """Note a problem; returns whether it is news."""
+        news = text not in self._current and text not in self._reported
+        if news:
+            self._logger.warning(text)
+        self._current[text] = None
+        return news
+
+    def take(self) -> str:
+        """Return all problems since the last call as one line, "" when there were none."""
+        self._reported, self._current = self._current, {}
+        return "; ".join(self._reported)
+
+
 class Diagnostics:
     """Publishes a node's status regularly and on demand.
 

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot
-from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Status
+from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import (
     SENSOR,
     SENSOR_SOURCE,
@@ -52,7 +52,7 @@ class EncoderSlipNode(Node):
         self._output: encoder_slip.EncoderSlipOutput | None = None
         self._watch = StampWatch()
         self._period, self._since_published = 1.0 / rate, 0.0
-        self._unusable, self._last_problem = 0, ""
+        self._unusable, self._problems = 0, Problems(self)
         self._ever = np.zeros((self.robot.n, 2), dtype=bool)  # flagged since the last report
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
         self._names = [f"{caster}_{direction}" for caster in self.robot.caster_names for direction in _DIRECTIONS]
@@ -74,7 +74,7 @@ class EncoderSlipNode(Node):
             self._state, output = encoder_slip.step(self.robot, self._thresholds, self._state, position, velocity, dt or 0.0)
         except PcwError as error:
             self._unusable += 1
-            self._last_problem = str(error)
+            self._problems.add(str(error))
             return
         self._output = output
         flagged = output.slipping | output.skidding
@@ -96,7 +96,7 @@ class EncoderSlipNode(Node):
         values: dict[str, object] = {"gaps": self._watch.gaps, "repeated_stamps": self._watch.repeats}
         values |= {"backward_jumps": self._watch.backward_jumps, "unusable_joint_states": self._unusable}
         output = self._output
-        level, text = OK, "no slip"
+        level, text, problems = OK, "no slip", self._problems.take()
         if output is not None:
             values["threshold"] = output.threshold
             for name, slipping, skidding in zip(self._names, output.slipping.ravel(), output.skidding.ravel()):
@@ -104,9 +104,8 @@ class EncoderSlipNode(Node):
             self._ever = output.slipping | output.skidding
         if flagged:
             level, text = WARN, "slip since the last report: " + ", ".join(flagged)
-        elif self._last_problem:
-            level, text = WARN, self._last_problem
-        self._last_problem = ""
+        elif problems:
+            level, text = WARN, problems
         return Status(level, text, values)
 
 

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot, odometry
-from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Status
+from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import (
     SENSOR,
     SENSOR_SOURCE,
@@ -61,7 +61,7 @@ class OdometryNode(Node):
         self._watch = StampWatch(longest_gap)
         self._period = 1.0 / rate
         self._clear_mean()
-        self._unusable, self._last_problem = 0, ""
+        self._unusable, self._problems = 0, Problems(self)
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
         self._warm_up()
         self._odom = self.create_publisher(Odometry, "odom", SENSOR_SOURCE)
@@ -90,7 +90,7 @@ class OdometryNode(Node):
             )
         except PcwError as error:
             self._unusable += 1
-            self._last_problem = str(error)
+            self._problems.add(str(error))
             return
         if dt is None:
             return
@@ -120,8 +120,8 @@ class OdometryNode(Node):
             self._tf.publish(TFMessage(transforms=[transform]))
 
     def _status(self) -> Status:
-        level, text = (WARN, self._last_problem) if self._last_problem else (OK, "integrating")
-        self._last_problem = ""
+        problems = self._problems.take()
+        level, text = (WARN, problems) if problems else (OK, "integrating")
         return Status(
             level, text,
             {

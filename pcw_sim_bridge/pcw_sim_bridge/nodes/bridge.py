@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from pcw_description import PcwError, load_robot
-from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Status
+from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import COMMAND, declare, joint_state_arrays, run_node, stamp_to_ns
 
 from ..plants.plant import PLANT_NAMES, PlantError, make_plant
@@ -69,7 +69,8 @@ class BridgeNode(Node):
         self._paused: bool = self.get_parameter("start_paused").value
         self._fault = ""
         self._begun = False  # the readings at time zero are out
-        self._refused_commands, self._refusal = 0, ""
+        self._problems = Problems(self)
+        self._refused_commands = 0
         self._overruns = self._unanswered = 0
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = None
@@ -150,9 +151,7 @@ class BridgeNode(Node):
         except PcwError as error:
             self._simulated.command(None)
             self._refused_commands += 1
-            if str(error) != self._refusal:
-                self._refusal = str(error)
-                self.get_logger().warning(f"{error}; the torque is zero")
+            if self._problems.add(f"{error}; the torque is zero"):
                 self._diagnostics.report()
         if self._lockstep and stamp_to_ns(message.header.stamp) >= self._simulated.time_ns:
             self._answered = True
@@ -206,16 +205,16 @@ class BridgeNode(Node):
         now, then = (time.monotonic(), self._simulated.time_ns), self._reported
         self._reported = now
         factor = (now[1] - then[1]) * 1e-9 / max(now[0] - then[0], 1e-9)
+        problems = self._problems.take()
         level, message = OK, "paused" if self._paused else "running"
         if self._fault:
             level, message = ERROR, self._fault
-        elif self._refusal:
-            level, message = WARN, f"refused: {self._refusal}"
+        elif problems:
+            level, message = WARN, problems
         elif not self._begun and self._lockstep:
             level, message = WARN, "lock-step waits for a controller"
         elif self._simulated.timed_out:
             level, message = WARN, "no command within command_timeout; the torque is zero"
-        self._refusal = ""
         return Status(
             level, message,
             {

@@ -1,0 +1,263 @@
+"""The controller as a process over real DDS: it drives, and it lets go of the robot whenever in doubt."""
+
+import math
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import PoseStamped, TwistStamped  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from pcw_description import inverse_kinematics, load_robot  # noqa: E402
+from pcw_description.nodes.node_testing import RosTest  # noqa: E402
+from pcw_description.nodes.node_tools import ns_to_stamp, stamp_to_ns  # noqa: E402
+
+CONTROLLER = "pcw_control.nodes.computed_torque"
+THESIS = load_robot("thesis")
+NAMES = list(THESIS.joint_names)
+PERIOD_NS = 2_000_000
+
+
+@pytest.fixture
+def ros():
+    with RosTest() as ros:
+        yield ros
+
+
+class Robot:
+    """An ideal robot that publishes joint_states 2 ms apart, one for each command it gets, and cmd_vel.
+
+    It follows the force of the last torque as if it were a mass on ice; the tests care for what the controller sends.
+    """
+
+    def __init__(self, ros, target=(0.3, 0.0, 0.0)):
+        self.ros, self.target = ros, target
+        self.time_ns, self.twist, self.position = 0, np.zeros(3), np.zeros((4, 2))
+        self.commands, self.bad_velocity = [], False
+        self.states = ros.peer.create_publisher(JointState, "joint_states", 10)
+        self.cmd_vel = ros.peer.create_publisher(TwistStamped, "cmd_vel", 1)
+        ros.peer.create_subscription(JointState, "joint_commands", self._on_command, 1000)
+
+    @property
+    def torque(self):
+        return np.array(self.commands[-1].effort).reshape(4, 2)
+
+    def _on_command(self, message):
+        self.commands.append(message)
+
+    def publish_states(self):
+        self.time_ns += PERIOD_NS
+        if self.commands:
+            force = self.torque[:, 0].sum() / 0.075
+            self.twist = self.twist + np.array([force / 100.0 * 0.002, 0.0, 0.0])
+        rates = inverse_kinematics(THESIS, np.zeros(4), self.twist)
+        self.position = self.position + rates * 0.002
+        message = JointState(name=NAMES, position=self.position.ravel().tolist(), velocity=rates.ravel().tolist())
+        if self.bad_velocity:
+            message.velocity[3] = math.nan
+        message.header.stamp = ns_to_stamp(self.time_ns)
+        self.states.publish(message)
+
+    def publish_twist(self):
+        message = TwistStamped()
+        message.header.frame_id = "base_link"
+        message.twist.linear.x, message.twist.linear.y, message.twist.angular.z = self.target
+        self.cmd_vel.publish(message)
+
+    def run(self, condition, cmd_vel=True):
+        """Publish joint_states, and cmd_vel, until the condition holds."""
+
+        def publish():
+            if cmd_vel:
+                self.publish_twist()
+            self.publish_states()
+
+        return self.ros.wait_for(condition, while_doing=publish, every=0.004)
+
+    def drives(self):
+        return bool(self.commands) and self.torque[:, 0].sum() > 1.0
+
+    def let_go(self):
+        return bool(self.commands) and not self.torque.any()
+
+
+def warnings_of(diagnostics):
+    return " ".join(s.message for d in diagnostics for s in d.status)
+
+
+def test_follows_cmd_vel_and_stamps_each_answer_with_its_question(ros):
+    controller = ros.start(CONTROLLER)
+    robot = Robot(ros)
+    robot.run(robot.drives)
+    robot.run(lambda: abs(robot.twist[0] - 0.3) < 0.01)
+    command = robot.commands[-1]
+    assert command.name == NAMES and not command.velocity and not command.position
+    assert 0 < stamp_to_ns(command.header.stamp) <= robot.time_ns
+    assert np.all(np.abs(robot.torque) <= THESIS.torque_limit)
+    assert controller.interrupt() == 0
+
+
+def test_without_cmd_vel_it_lets_go(ros):
+    ros.start(CONTROLLER, "-p", "cmd_vel_timeout:=0.1")
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    robot.run(robot.let_go, cmd_vel=False)  # nothing was ever wanted
+    robot.run(robot.drives)
+    since = robot.time_ns
+    robot.run(robot.let_go, cmd_vel=False)
+    assert robot.time_ns - since >= 0.09e9
+    ros.wait_for(lambda: "cmd_vel_timeout" in warnings_of(diagnostics))
+
+
+def test_without_joint_states_it_lets_go(ros):
+    ros.start(CONTROLLER)
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    robot.run(robot.drives)
+    ros.wait_for(robot.let_go, while_doing=robot.publish_twist)
+    ros.wait_for(lambda: "joint_states_timeout" in warnings_of(diagnostics))
+    robot.run(robot.drives)  # and takes over again
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_go_before_the_end(ros, number):
+    controller = ros.start(CONTROLLER)
+    robot = Robot(ros)
+    robot.run(robot.drives)
+    assert controller.interrupt(number) == 0
+    ros.wait_for(robot.let_go)
+
+
+def test_nan_in_lets_go_and_never_comes_out(ros):
+    ros.start(CONTROLLER)
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    robot.run(robot.drives)
+    robot.bad_velocity = True
+    robot.run(robot.let_go)
+    ros.wait_for(lambda: "joint_velocity" in warnings_of(diagnostics))
+    robot.bad_velocity = False
+    robot.run(robot.drives)
+    robot.target = (math.nan, 0.0, 0.0)
+    robot.run(robot.let_go)
+    ros.wait_for(lambda: "refused: cmd_vel" in warnings_of(diagnostics))
+    assert all(np.isfinite(command.effort).all() for command in robot.commands)
+
+
+def test_goes_to_a_goal(ros):
+    ros.start(CONTROLLER, "-p", "goal_speed:=1.0", "-p", "goal_acceleration:=2.0")
+    robot = Robot(ros)
+    robot.run(lambda: robot.commands, cmd_vel=False)
+    goals = ros.peer.create_publisher(PoseStamped, "goal_pose", 1)
+    ros.wait_for(lambda: goals.get_subscription_count() > 0)
+    goal = PoseStamped()
+    goal.header.frame_id = "odom"
+    goal.pose.position.x, goal.pose.orientation.w = 0.2, 1.0
+    goals.publish(goal)
+    robot.run(robot.drives, cmd_vel=False)
+    # cmd_vel has a timeout, a goal has none: it is reached and held.
+    travelled = lambda: robot.position[:, 0].mean() * 0.075  # noqa: E731
+    robot.run(lambda: abs(travelled() - 0.2) < 0.002 and abs(robot.twist[0]) < 0.002, cmd_vel=False)
+
+    goal.header.frame_id = "map"
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    goals.publish(goal)
+    ros.wait_for(lambda: "in frame 'map'" in warnings_of(diagnostics))
+
+
+def change_state(ros, transition):
+    return ros.call(
+        ChangeState, "computed_torque/change_state", ChangeState.Request(transition=Transition(id=transition))
+    ).success
+
+
+def test_lifecycle_lets_go_on_deactivation_and_can_be_cleaned_up(ros):
+    ros.start(CONTROLLER, "-p", "autostart:=false")
+    robot = Robot(ros)
+    state = ros.call(GetState, "computed_torque/get_state").current_state.label
+    assert state == "unconfigured"
+    assert change_state(ros, Transition.TRANSITION_CONFIGURE)
+    ros.wait_for(lambda: robot.states.get_subscription_count() > 0)
+    for _ in range(20):
+        robot.publish_twist()
+        robot.publish_states()
+        ros.spin_once()
+    assert robot.commands == []  # configured is not active
+    assert change_state(ros, Transition.TRANSITION_ACTIVATE)
+    robot.run(robot.drives)
+    assert change_state(ros, Transition.TRANSITION_DEACTIVATE)
+    ros.wait_for(robot.let_go)
+    count = len(robot.commands)
+    for _ in range(20):
+        robot.publish_states()
+        ros.spin_once()
+    assert len(robot.commands) == count
+    assert change_state(ros, Transition.TRANSITION_ACTIVATE)
+    robot.run(robot.drives)
+    assert change_state(ros, Transition.TRANSITION_DEACTIVATE)
+    assert change_state(ros, Transition.TRANSITION_CLEANUP)
+    assert change_state(ros, Transition.TRANSITION_CONFIGURE)
+
+
+def test_gaps_repeats_and_jumps_of_the_stamps_are_counted_and_let_go(ros):
+    ros.start(CONTROLLER)
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+
+    def counts():
+        values = [{v.key: v.value for v in s.values} for d in diagnostics for s in d.status]
+        return values[-1] if values else {}
+
+    robot.run(robot.drives)
+    robot.time_ns += 1_000_000_000
+    robot.publish_states()
+    ros.wait_for(robot.let_go)
+    robot.run(robot.drives)
+    robot.time_ns -= 500_000_000
+    robot.publish_states()
+    ros.wait_for(robot.let_go)
+    robot.run(robot.drives)
+    robot.time_ns -= PERIOD_NS
+    robot.publish_states()
+    ros.wait_for(lambda: counts().get("gaps") == "1" and counts().get("backward_jumps") == "1")
+    ros.wait_for(lambda: counts().get("repeated_stamps") == "1")
+
+
+def test_refused_parameter_keeps_the_old_value(ros):
+    ros.start(CONTROLLER)
+
+    def set_gain(value):
+        number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+        parameter = Parameter(name="velocity_gain", value=number)
+        request = SetParameters.Request(parameters=[parameter])
+        [result] = ros.call(SetParameters, "computed_torque/set_parameters", request).results
+        request = GetParameters.Request(names=["velocity_gain"])
+        [found] = ros.call(GetParameters, "computed_torque/get_parameters", request).values
+        return result.successful, found.double_value
+
+    assert set_gain(-1.0) == (False, 20.0)
+    assert set_gain(math.inf) == (False, 20.0)
+    assert set_gain(10.0) == (True, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "complaint"),
+    [
+        ("robot:=/no/such/robot.yaml", "/no/such/robot.yaml"),
+        ("velocity_gain:=-3.0", "velocity_gain"),
+        ("robot:=mpo700", "torque control"),
+    ],
+)
+def test_bad_input_ends_it_with_one_line(parameter, complaint):
+    result = subprocess.run(
+        [sys.executable, "-m", CONTROLLER, "--ros-args", "-p", parameter], capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 2
+    assert complaint in result.stderr and "Traceback" not in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1

@@ -1,0 +1,183 @@
+"""For tests of nodes: real processes and a peer that talks to them over real DDS, alone in a domain of their own.
+
+    with RosTest() as ros:
+        node = ros.start("pcw_estimation.nodes.odometry", "-p", "robot:=thesis")
+        states = ros.peer.create_publisher(JointState, "joint_states", 10)
+        odom = ros.listen(Odometry, "odom")
+        ros.wait_for(lambda: odom, while_doing=lambda: states.publish(message))
+        assert node.interrupt() == 0
+
+Nothing sleeps for a fixed time: everything waits for what it needs and fails at a deadline, with what the nodes said.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from .node_tools import EventsExecutor
+
+# First contact takes seconds on a busy machine, and a cold cache compiles kernels; waits end as soon as they can [s].
+DEADLINE = 60.0
+
+
+class NodeProcess:
+    """One process that was started by a test."""
+
+    def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path) -> None:
+        self._log_path = log
+        with log.open("w") as output:
+            # A session of its own: a signal to the test must reach the child through the test alone.
+            self.process = subprocess.Popen(
+                command, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+
+    @property
+    def log(self) -> str:
+        """What it has printed so far."""
+        return self._log_path.read_text(errors="replace")
+
+    def wait(self, deadline: float = DEADLINE) -> int:
+        """Wait for its end and return the exit code."""
+        try:
+            return self.process.wait(timeout=deadline)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {deadline:g} s; it said:\n{self.log}") from None
+
+    def interrupt(self, number: signal.Signals = signal.SIGINT, deadline: float = DEADLINE) -> int:
+        """Send a signal, wait for the end and return the exit code."""
+        self.process.send_signal(number)
+        return self.wait(deadline)
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+
+class RosTest:
+    """A ROS domain that no other test uses, processes in it, and one node of our own: `peer`."""
+
+    def __init__(self) -> None:
+        self.domain, self._lock = _own_domain()
+        self._folder = tempfile.TemporaryDirectory()
+        self._processes: list[NodeProcess] = []
+        self.environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(self.domain)}
+        previous = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        try:
+            self._context = Context()
+            rclpy.init(context=self._context, domain_id=self.domain)
+        finally:
+            if previous is None:
+                del os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
+            else:
+                os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = previous
+        self.peer = Node("test_peer", context=self._context)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.peer)
+
+    def __enter__(self) -> RosTest:
+        """Return itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """End every process and leave the domain."""
+        for process in self._processes:
+            process.kill()
+            if error is not None:
+                print(f"--- {process.process.args}\n{process.log}", file=sys.stderr)
+        self._executor.shutdown()
+        self.peer.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+        self._folder.cleanup()
+        self._lock.close()
+
+    def start(self, module: str, *ros_arguments: str, before: Sequence[str] = ()) -> NodeProcess:
+        """Run `python -m module before... --ros-args ros_arguments...`."""
+        command = [sys.executable, "-m", module, *before]
+        if ros_arguments:
+            command += ["--ros-args", *ros_arguments]
+        return self.run(command)
+
+    def run(self, command: Sequence[str]) -> NodeProcess:
+        """Run a command in this domain."""
+        process = NodeProcess(command, self.environment, Path(self._folder.name) / f"{len(self._processes)}.log")
+        self._processes.append(process)
+        return process
+
+    def listen(self, message_type: type, topic: str, qos: QoSProfile | int = 1000) -> list[Any]:
+        """Return a list to which every message of a topic is appended."""
+        received: list[Any] = []
+        self.peer.create_subscription(message_type, topic, received.append, qos)
+        return received
+
+    def spin_once(self) -> None:
+        """Handle what has arrived, or wait 20 ms for something."""
+        self._executor.spin_once(timeout_sec=0.02)
+
+    def wait_for(
+        self,
+        condition: Callable[[], Any],
+        deadline: float = DEADLINE,
+        while_doing: Callable[[], object] | None = None,
+        every: float = 0.02,
+    ) -> Any:
+        """Return what `condition()` returns once that is true; call `while_doing` every so often [s] meanwhile."""
+        end, next_call = time.monotonic() + deadline, 0.0
+        while True:
+            found = condition()
+            if found:
+                return found
+            now = time.monotonic()
+            if now > end:
+                said = "\n".join(f"--- {process.process.args}\n{process.log}" for process in self._processes)
+                raise AssertionError(f"not within {deadline:g} s\n{said}")
+            if while_doing is not None and now >= next_call:
+                while_doing()
+                next_call = now + every
+            self.spin_once()
+
+    def spin_for(self, duration: float, while_doing: Callable[[], object] | None = None, every: float = 0.02) -> None:
+        """Handle what arrives for so long [s]; for showing that something does not happen."""
+        end = time.monotonic() + duration
+        self.wait_for(lambda: time.monotonic() > end, duration + DEADLINE, while_doing, every)
+
+    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
+        """Call a service and return its response."""
+        client = self.peer.create_client(service_type, name)
+        try:
+            self.wait_for(client.service_is_ready)
+            future = client.call_async(request if request is not None else service_type.Request())
+            self.wait_for(future.done)
+            return future.result()
+        finally:
+            self.peer.destroy_client(client)
+
+
+def _own_domain() -> tuple[int, TextIO]:
+    """Return a domain id that no other test on this machine uses, and the lock that says so while it is open."""
+    # Up to 101: above, the ports of DDS may meet those the system gives to others.
+    for domain in range(20, 102):
+        lock = (Path(tempfile.gettempdir()) / f"pcw_test_domain_{os.getuid()}_{domain}.lock").open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return domain, lock
+        except BlockingIOError:
+            lock.close()
+    raise RuntimeError("all ROS domains for tests are in use")
