@@ -1,280 +1,41 @@
-"""The channels of a robot on powered casters: what its encoders, motors and inertial sensor say that the model does not.
+"""Builds the regression problem of a robot: its channels, what a healthy one may differ in, and every candidate effect.
 
-    chassis_force/x|y, chassis_torque/z    H[A^T F] - H[m a of chassis and modules]        motors against motion
-    gyro                                   H[omega_imu] - H[omega]
-    accelerometer/x|y                      H[a_imu] - H[acceleration at the sensor]
-
-with H the same filter on both sides. Each joint's own balance gives the force at its contact,
-
-    r F_x = tau_rho - I_rho rho_ddot - J_rp phi_ddot
-    b_x F_y - b_y F_x = m c x a_c + I sigma_dot + J_pp phi_ddot + J_rp rho_ddot - tau_phi
-
-and the tyre under that force slips: eps = |V_w| lambda(F) + L d lambda / dt, the relaxed slip solved for eps. The robot's
-twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a missing force of a tenth of
-the whole, growing with frequency; the channels end well below the resonance of the robot on its tyres.
-
-Every number of the description that a healthy robot may differ in is a nuisance column, by differences of the whole
-model; so is every effect. Robots whose wheels have no offset along their heading (b_x = 0) have no torque balance here.
+The channels are those of `rolling_model`. Every number of the description that may differ within its tolerance is a
+nuisance column, and every effect a candidate; both by differences of the whole model, so that none is derived by hand.
 """
 
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pcw_description.augmented_object_model import dynamic_parameters
-from pcw_description.compiled import compiled
-from pcw_description.differential_kinematics import forward_kinematics_kernel
 from pcw_description.effects.effect import DescriptionEffect, JointTorqueEffect
 from pcw_description.effects.registry import all_effects
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
 
-from ..plants.reduced import support_forces
 from .axis_channels import kernel_arguments
 from .errors import MismatchError
-from .regression_problem import BoolArray, Channel, FloatArray, LinearParameter, Nuisance, RegressionProblem, Shape, Term
-from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
+from .regression_problem import (
+    BoolArray,
+    Channel,
+    FloatArray,
+    LinearParameter,
+    Nuisance,
+    RegressionProblem,
+    Shape,
+    Term,
+)
+from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
+from .rolling_model import ModelNumbers, channel_sides, normal_forces, twists
+from .signal_filter import SignalFilter, derivative
 
-LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
-SMALLEST_CUTOFF = 3.0
-# Effects are evaluated on signals filtered this much wider than the channels, so that they see sharp reversals.
-PREFILTER_RATIO = 2.5
-# Rate of the motions that the model is evaluated on, per cut-off of the wide filter: derivatives stay exact to a percent.
-MOTION_OVERSAMPLING = 5.0
-# The channels end at this part of the resonance of the robot on its tyres.
-TYRE_MARGIN = 0.5
-ALLOWED_DERIVATIVE_NOISE = 0.05
-LARGEST_GAP = 0.05  # [s]
-SHORTEST_SEGMENT = 1.0  # [s]
 # Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
 SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
-
-
-@dataclasses.dataclass
-class ModelNumbers:
-    """All numbers of the channel model, as arrays to be varied.
-
-    Attributes:
-        chassis: (4,) as in `dynamic_parameters`; modules: (n, 9) likewise; com_height: [m].
-        steer_axis, caster_offset, radius: geometry (n, 2), (n, 2), (n,).
-        steer_zero: error of the measured headings (n,) [rad].
-        gain: true over reported motor torque (n, 2).
-        imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
-        slip: slip at the contact per nominal slip of the tyre.
-        critical_slip, peak_friction, relaxation_length: of the nominal tyre.
-        torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
-    """
-
-    chassis: FloatArray
-    modules: FloatArray
-    com_height: float
-    steer_axis: FloatArray
-    caster_offset: FloatArray
-    radius: FloatArray
-    steer_zero: FloatArray
-    gain: FloatArray
-    imu_position: FloatArray
-    gyro_bias: float
-    gyro_scale: float
-    accelerometer_bias: FloatArray
-    slip: float
-    critical_slip: float
-    peak_friction: float
-    relaxation_length: float
-    torque_lag: float
-
-    @classmethod
-    def of(cls, robot: RobotDescription) -> ModelNumbers:
-        """Take the numbers of a description."""
-        chassis, modules = dynamic_parameters(robot)
-        imu = robot.sensors.imu
-        return cls(
-            chassis=chassis,
-            modules=modules,
-            com_height=robot.chassis.com[2],
-            steer_axis=robot.steer_axis.copy(),
-            caster_offset=robot.caster_offset.copy(),
-            radius=robot.wheel_radius.copy(),
-            steer_zero=np.zeros(robot.n),
-            gain=np.ones((robot.n, 2)),
-            imu_position=np.array(imu.position[:2]) if imu else np.zeros(2),
-            gyro_bias=0.0,
-            gyro_scale=1.0,
-            accelerometer_bias=np.zeros(2),
-            slip=1.0,
-            critical_slip=robot.contact.lambda_p,
-            peak_friction=robot.contact.mu_p,
-            relaxation_length=robot.contact.relaxation_length,
-            torque_lag=0.0,
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class RobotMotion:
-    """One contiguous piece on a regular grid after the wide filter; arrays along T.
-
-    Attributes:
-        rate: [Hz].
-        sampling: interval of joint_states [s].
-        position, velocity, acceleration, torque, torque_rate: joints (T, n, 2).
-        imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
-    """
-
-    recording: int
-    rate: float
-    sampling: float
-    time: FloatArray
-    position: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    torque: FloatArray
-    torque_rate: FloatArray
-    imu: FloatArray
-
-
-@compiled
-def _twists(steer_axis, caster_offset, radius, steer_angle, velocity):  # type: ignore[no-untyped-def]
-    """Wheels' twist (T, 3) and largest consistency slip (T,) of joint motion (T, n), (T, n, 2)."""
-    count = len(steer_angle)
-    twist = np.empty((count, 3))
-    slip = np.empty(count)
-    for t in range(count):
-        twist[t], residual, _ = forward_kinematics_kernel(
-            steer_axis, caster_offset, radius, steer_angle[t], velocity[t]
-        )
-        slip[t] = np.sqrt(np.max(residual[:, 0] ** 2 + residual[:, 1] ** 2))
-    return twist, slip
-
-
-@compiled
-def _contact_forces(  # type: ignore[no-untyped-def]
-    modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, twist, twist_dot
-):
-    """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N]."""
-    force = np.empty_like(torque)
-    for t in range(len(torque)):
-        vx, vy, omega = twist[t, 0], twist[t, 1], twist[t, 2]
-        for i in range(len(radius)):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
-            m, cx, cy = modules[i, 0], modules[i, 1], modules[i, 2]
-            lever_x, lever_y = cx * c - cy * s, cx * s + cy * c
-            sx, sy = steer_axis[i, 0], steer_axis[i, 1]
-            sigma = velocity[t, i, 1] + omega
-            sigma_dot = acceleration[t, i, 1] + twist_dot[t, 2]
-            ax = (
-                twist_dot[t, 0]
-                - omega * vy
-                - twist_dot[t, 2] * sy
-                - omega * omega * sx
-                - sigma_dot * lever_y
-                - sigma * sigma * lever_x
-            )
-            ay = (
-                twist_dot[t, 1]
-                + omega * vx
-                + twist_dot[t, 2] * sx
-                - omega * omega * sy
-                + sigma_dot * lever_x
-                - sigma * sigma * lever_y
-            )
-            roll_inertia = modules[i, 4] + modules[i, 5]
-            along = (
-                torque[t, i, 0] - roll_inertia * acceleration[t, i, 0] - modules[i, 6] * acceleration[t, i, 1]
-            ) / radius[i]
-            turning = m * (lever_x * ay - lever_y * ax) + modules[i, 3] * sigma_dot
-            turning += (
-                modules[i, 7] * acceleration[t, i, 1]
-                + modules[i, 6] * acceleration[t, i, 0]
-                - torque[t, i, 1]
-            )
-            force[t, i, 0] = along
-            force[t, i, 1] = (turning + caster_offset[i, 1] * along) / caster_offset[i, 0]
-    return force
-
-
-@compiled
-def _wrench_of(steer_axis, caster_offset, steer_angle, force):  # type: ignore[no-untyped-def]
-    """Wrench A^T F on the base (T, 3) of contact forces (T, n, 2)."""
-    wrench = np.zeros((len(force), 3))
-    for t in range(len(force)):
-        for i in range(steer_angle.shape[1]):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
-            fx, fy = force[t, i, 0], force[t, i, 1]
-            bx, by = caster_offset[i, 0], caster_offset[i, 1]
-            px = steer_axis[i, 0] + bx * c - by * s
-            py = steer_axis[i, 1] + bx * s + by * c
-            gx, gy = c * fx - s * fy, s * fx + c * fy
-            wrench[t, 0] += gx
-            wrench[t, 1] += gy
-            wrench[t, 2] += px * gy - py * gx
-    return wrench
-
-
-@compiled
-def _inertial_wrench(  # type: ignore[no-untyped-def]
-    chassis, modules, steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
-):
-    """Wrench (T, 3) that accelerates chassis and modules as they move; rotors and rolling wheels are not in it."""
-    wrench = np.empty_like(twist)
-    for t in range(len(twist)):
-        vx, vy, omega = twist[t, 0], twist[t, 1], twist[t, 2]
-        dx, dy, alpha = twist_dot[t, 0] - omega * vy, twist_dot[t, 1] + omega * vx, twist_dot[t, 2]
-        mass, cx, cy = chassis[0], chassis[1], chassis[2]
-        ax, ay = dx - alpha * cy - omega * omega * cx, dy + alpha * cx - omega * omega * cy
-        fx, fy, moment = mass * ax, mass * ay, chassis[3] * alpha + mass * (cx * ay - cy * ax)
-        for i in range(len(modules)):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
-            lever_x, lever_y = modules[i, 1] * c - modules[i, 2] * s, modules[i, 1] * s + modules[i, 2] * c
-            sx, sy = steer_axis[i, 0], steer_axis[i, 1]
-            sigma, sigma_dot = steer_rate[t, i] + omega, steer_acceleration[t, i] + alpha
-            ax = dx - alpha * sy - omega * omega * sx - sigma_dot * lever_y - sigma * sigma * lever_x
-            ay = dy + alpha * sx - omega * omega * sy + sigma_dot * lever_x - sigma * sigma * lever_y
-            m = modules[i, 0]
-            fx += m * ax
-            fy += m * ay
-            moment += modules[i, 3] * sigma_dot + m * ((sx + lever_x) * ay - (sy + lever_y) * ax)
-        wrench[t, 0], wrench[t, 1], wrench[t, 2] = fx, fy, moment
-    return wrench
-
-
-@compiled
-def _normal_forces(mass, com_x, com_y, com_z, steer_axis, caster_offset, steer_angle, acceleration):  # type: ignore[no-untyped-def]
-    """Quasi-static normal forces (T, n) [N] from the accelerations (T, 2)."""
-    normal = np.empty_like(steer_angle)
-    centre = np.empty_like(steer_axis)
-    for t in range(len(steer_angle)):
-        for i in range(steer_angle.shape[1]):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
-            centre[i, 0] = steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
-            centre[i, 1] = steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
-        support_forces(mass, com_x, com_y, com_z, acceleration[t, 0], acceleration[t, 1], centre, normal[t])
-    return normal
-
-
-def normal_forces(numbers: ModelNumbers, steer_angle: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Quasi-static normal forces (T, n) [N] on the wheels under accelerations (T, 2 or more) in base_link."""
-    chassis, modules = numbers.chassis, numbers.modules
-    module_mass = modules[:, 0].sum()
-    mass = chassis[0] + module_mass
-    centre = (chassis[0] * chassis[1:3] + (modules[:, :1] * numbers.steer_axis).sum(axis=0)) / mass
-    height = (chassis[0] * numbers.com_height + (modules[:, 0] * numbers.radius).sum()) / mass
-    forces: FloatArray = _normal_forces(
-        mass,
-        centre[0],
-        centre[1],
-        height,
-        numbers.steer_axis,
-        numbers.caster_offset,
-        steer_angle,
-        acceleration,
-    )
-    return forces
 
 
 class RobotProblemBuilder:
@@ -291,18 +52,26 @@ class RobotProblemBuilder:
             cutoff: of the channel filter [Hz]; None chooses it from the noise of the encoders.
 
         Raises:
-            MismatchError: no torques were recorded, or no recording has a piece long enough.
+            MismatchError: neither torques nor an inertial sensor were recorded, or no piece is long enough.
         """
         self.robot = robot
-        self.balanced = bool(np.all(np.abs(robot.caster_offset[:, 0]) > 1e-3))
+        with_torque = all(
+            r.joint_states.effort is not None and np.isfinite(r.joint_states.effort).any() for r in recordings
+        )
+        self.balanced = with_torque and bool(np.all(np.abs(robot.caster_offset[:, 0]) > 1e-3))
         self.cutoff = cutoff if cutoff is not None else choose_cutoff(robot, recordings)
         self.motions: list[RobotMotion] = []
         for index, recording in enumerate(recordings):
-            self._add(recording, index)
+            self.motions += read_motions(robot, recording, index, self.cutoff, self.balanced)
         if not self.motions:
             raise MismatchError(f"no contiguous piece of at least {SHORTEST_SEGMENT:g} s in the recordings")
         self.filters = [SignalFilter(m.rate, self.cutoff) for m in self.motions]
         self.has_imu = any(np.isfinite(m.imu).any() for m in self.motions)
+        if not self.balanced and not self.has_imu:
+            raise MismatchError(
+                "neither motor torques (effort in joint_states, of casters with an offset) nor imu/data were recorded; "
+                "nothing can be compared"
+            )
         self.numbers = ModelNumbers.of(self._with_nominal_changes(robot))
 
     def _with_nominal_changes(self, robot: RobotDescription) -> RobotDescription:
@@ -313,55 +82,10 @@ class RobotProblemBuilder:
                 robot = effect.apply(robot, instance.target, instance.parameters)
         return robot
 
-    def _add(self, recording: Recording, index: int) -> None:
-        joints = recording.joint_states
-        n = self.robot.n
-        torque = joints.effort if joints.effort is not None else np.full_like(joints.position, np.nan)
-        if self.balanced and not np.isfinite(torque).any():
-            raise MismatchError(
-                f"{recording.path}: joint_states holds no effort (motor torque); without it no force can be judged"
-            )
-        signals = np.concatenate([joints.position.reshape(-1, 2 * n), torque.reshape(-1, 2 * n)], axis=1)
-        imu = np.full((len(signals), 3), np.nan)
-        if recording.imu is not None:
-            measured = np.column_stack([recording.imu.gyro[:, 2], recording.imu.acceleration[:, :2]])
-            for column in range(3):
-                imu[:, column] = np.interp(
-                    joints.stamp, recording.imu.stamp, measured[:, column], left=np.nan, right=np.nan
-                )
-        signals = np.concatenate([signals, imu], axis=1)
-        rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
-        wide = SignalFilter(rate, PREFILTER_RATIO * self.cutoff)
-        step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
-        for stamps, values in pieces:
-            needed = 4 * n if self.balanced else 2 * n
-            finite = np.isfinite(values[:, :needed]).all(axis=1)
-            for start, stop in _runs(np.asarray(finite, dtype=bool)):
-                if stamps[stop - 1] - stamps[start] < SHORTEST_SEGMENT:
-                    continue
-                block = values[start:stop]
-                smooth = wide.smooth(np.where(np.isfinite(block), block, 0.0))
-                position = smooth[:, : 2 * n].reshape(-1, n, 2)
-                velocity = derivative(position, rate)
-                torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
-                keep = slice(None, None, step)
-                sensed = np.where(np.isfinite(block[:, 4 * n :]), smooth[:, 4 * n :], np.nan)
-                self.motions.append(
-                    RobotMotion(
-                        recording=index,
-                        rate=rate / step,
-                        sampling=1.0 / rate,
-                        time=stamps[start:stop][keep],
-                        position=position[keep].copy(),
-                        velocity=velocity[keep].copy(),
-                        acceleration=derivative(velocity, rate)[keep].copy(),
-                        torque=torque[keep].copy(),
-                        torque_rate=derivative(torque, rate)[keep].copy(),
-                        imu=sensed[keep],
-                    )
-                )
-
-    # -- the model ----------------------------------------------------------------------------------------------
+    def _sides(
+        self, motion: RobotMotion, numbers: ModelNumbers, added_torque: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        return channel_sides(motion, numbers, self.balanced, self.has_imu, added_torque)
 
     def channels(self) -> tuple[Channel, ...]:
         """Channels that these recordings can fill."""
@@ -372,108 +96,6 @@ class RobotProblemBuilder:
             names.append(Channel("gyro", "rad/s", axis="imu"))
             names += [Channel(f"accelerometer/{axis}", "m/s^2", axis="imu") for axis in "xy"]
         return tuple(names)
-
-    def _sides(
-        self, motion: RobotMotion, numbers: ModelNumbers, added_torque: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Measured and predicted side of every channel at the motion's rate, (T, C) each.
-
-        `added_torque` (T, n, 2) acts on the joints besides the motors'.
-        """
-        steer_angle = np.ascontiguousarray(motion.position[:, :, STEER]) + numbers.steer_zero
-        geometry = numbers.steer_axis, numbers.caster_offset
-        twist, _ = _twists(*geometry, numbers.radius, steer_angle, motion.velocity)
-        measured, predicted = [], []
-        if self.balanced:
-            torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
-            if added_torque is not None:
-                torque = torque + added_torque
-            force = _contact_forces(
-                numbers.modules,
-                *geometry,
-                numbers.radius,
-                steer_angle,
-                motion.velocity,
-                motion.acceleration,
-                torque,
-                twist,
-                derivative(twist, motion.rate),
-            )
-            twist = twist - self._slip_twist(motion, numbers, steer_angle, twist, force)
-            twist_dot = derivative(twist, motion.rate)
-            measured.append(_wrench_of(*geometry, steer_angle, force))
-            predicted.append(
-                _inertial_wrench(
-                    numbers.chassis,
-                    numbers.modules,
-                    numbers.steer_axis,
-                    steer_angle,
-                    np.ascontiguousarray(motion.velocity[:, :, STEER]),
-                    np.ascontiguousarray(motion.acceleration[:, :, STEER]),
-                    twist,
-                    twist_dot,
-                )
-            )
-        else:
-            twist_dot = derivative(twist, motion.rate)
-        if self.has_imu:
-            x, y = numbers.imu_position
-            omega, alpha = twist[:, 2], twist_dot[:, 2]
-            measured.append(motion.imu)
-            predicted.append(
-                np.stack(
-                    [
-                        numbers.gyro_scale * omega + numbers.gyro_bias,
-                        twist_dot[:, 0]
-                        - omega * twist[:, 1]
-                        - alpha * y
-                        - omega**2 * x
-                        + numbers.accelerometer_bias[0],
-                        twist_dot[:, 1]
-                        + omega * twist[:, 0]
-                        + alpha * x
-                        - omega**2 * y
-                        + numbers.accelerometer_bias[1],
-                    ],
-                    axis=1,
-                )
-            )
-        return np.concatenate(measured, axis=1), np.concatenate(predicted, axis=1)
-
-    def _slip_twist(
-        self,
-        motion: RobotMotion,
-        numbers: ModelNumbers,
-        steer_angle: FloatArray,
-        twist: FloatArray,
-        force: FloatArray,
-    ) -> FloatArray:
-        """Twist (T, 3) that the wheels show beyond the robot's: A^+ of the slip that carries the contact forces.
-
-        The force is inverted through the rising branch of Kiencke's curve, lambda = lambda_p m / (1 + sqrt(1 - m^2)) with
-        m = F / (mu_p F_z); all curves share its slope to first order.
-        """
-        twist_dot = derivative(twist, motion.rate)
-        acceleration = twist_dot[:, :2] + twist[:, 2:] * np.stack([-twist[:, 1], twist[:, 0]], axis=1)
-        normal = np.maximum(normal_forces(numbers, steer_angle, acceleration), 1.0)
-        use = np.clip(force / (numbers.peak_friction * normal[:, :, None]), -0.99, 0.99)
-        ratio = numbers.slip * numbers.critical_slip * use / (1.0 + np.sqrt(1.0 - use**2))
-        rolling = np.hypot(
-            motion.velocity[:, :, DRIVE] * numbers.radius,
-            motion.velocity[:, :, STEER] * numbers.caster_offset[:, 0],
-        )
-        slip = rolling[:, :, None] * ratio + numbers.relaxation_length * derivative(ratio, motion.rate)
-        # A^+ of slips is A^+ B of the joint rates that would look like them.
-        as_rates = np.empty_like(slip)
-        as_rates[:, :, STEER] = slip[:, :, 1] / -numbers.caster_offset[:, 0]
-        as_rates[:, :, DRIVE] = (
-            slip[:, :, 0] - numbers.caster_offset[:, 1] * as_rates[:, :, STEER]
-        ) / numbers.radius
-        slip_twist, _ = _twists(
-            numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, as_rates
-        )
-        result: FloatArray = slip_twist
-        return result
 
     # -- the problem --------------------------------------------------------------------------------------------
 
@@ -510,7 +132,7 @@ class RobotProblemBuilder:
         numbers = self.numbers
         for motion, (measured, _) in zip(self.motions, sides, strict=True):
             steer_angle = np.ascontiguousarray(motion.position[:, :, STEER])
-            twist, slip = _twists(
+            twist, slip = twists(
                 numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, motion.velocity
             )
             speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * np.max(
@@ -704,7 +326,7 @@ class RobotProblemBuilder:
             numbers = self.numbers
             for motion in self.motions:
                 angle = np.ascontiguousarray(motion.position[:, :, STEER])
-                twist, _ = _twists(
+                twist, _ = twists(
                     numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity
                 )
                 twist_dot = derivative(twist, motion.rate)
@@ -730,7 +352,9 @@ class RobotProblemBuilder:
         if not self.balanced:
             return []
         terms = []
-        groups: list[tuple[tuple[str, ...], list[int]]] = [((name,), [i]) for i, name in enumerate(self.robot.caster_names)]
+        groups: list[tuple[tuple[str, ...], list[int]]] = [
+            ((name,), [i]) for i, name in enumerate(self.robot.caster_names)
+        ]
         groups.append((self.robot.caster_names, list(range(self.robot.n))))
         size = np.sqrt(np.mean(measured[:, :3] ** 2))
         for effect in all_effects().values():
@@ -854,7 +478,7 @@ class RobotProblemBuilder:
 
         for filter_, motion, normal in zip(self.filters, self.motions, self._normal, strict=True):
             angle = np.ascontiguousarray(motion.position[:, :, STEER])
-            twist, _ = _twists(
+            twist, _ = twists(
                 numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity
             )
             variables.setdefault("time", []).append(filter_.decimate(motion.time))
@@ -877,40 +501,3 @@ class RobotProblemBuilder:
                         np.ascontiguousarray(motion.torque[:, i, axis]),
                     )
         return {name: np.concatenate(parts) for name, parts in variables.items()}
-
-
-def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> float:
-    """Return the largest cut-off at which differentiated encoder noise stays small against the motion [Hz].
-
-    White noise s of a joint angle at the rate f_s, differentiated twice and cut at f_c, has the variance
-    2 s^2 (2 pi)^4 f_c^5 / (5 f_s); it may reach a part of the largest accelerations recorded.
-    """
-    contact = robot.contact
-    # Slip stiffness 2 mu_p F_z / lambda_p over the relaxation length: the spring between wheel and ground, per unit mass.
-    stiffness = 2.0 * contact.mu_p * 9.81 / (contact.lambda_p * contact.relaxation_length)
-    cutoffs = [LARGEST_CUTOFF, TYRE_MARGIN * float(np.sqrt(stiffness)) / (2.0 * np.pi)]
-    for recording in recordings:
-        joints = recording.joint_states
-        rate = 1.0 / float(np.median(np.diff(joints.stamp)))
-        cutoffs.append(rate / 8.0)
-        slow = SignalFilter(rate, min(5.0, rate / 8.0))
-        for i in range(robot.n):
-            angle = joints.position[:, i, DRIVE]
-            usable = np.isfinite(angle)
-            if usable.sum() < 4 * slow.settling:
-                continue
-            angle = angle[usable]
-            noise = white_noise_level(angle)
-            acceleration = derivative(derivative(slow.smooth(angle), rate), rate)[
-                slow.settling : -slow.settling
-            ]
-            allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(acceleration)), 1e-3)
-            if noise > 0.0:
-                cutoffs.append((allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)
-    return max(min(cutoffs), SMALLEST_CUTOFF)
-
-
-def _runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """Start and stop of every run of true values."""
-    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

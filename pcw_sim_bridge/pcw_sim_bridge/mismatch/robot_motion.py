@@ -1,0 +1,143 @@
+"""The motion in a robot's recording: cut at gaps, on a regular grid, filtered wide and differentiated."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pcw_description.recording import Recording
+from pcw_description.robot_description import DRIVE, RobotDescription
+
+from .regression_problem import BoolArray, FloatArray
+from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
+
+LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
+SMALLEST_CUTOFF = 3.0
+# Effects are evaluated on signals filtered this much wider than the channels, so that they see sharp reversals.
+PREFILTER_RATIO = 2.5
+# Rate of the motions that the model is evaluated on, per cut-off of the wide filter: derivatives stay exact to a percent.
+MOTION_OVERSAMPLING = 5.0
+# The channels end at this part of the resonance of the robot on its tyres.
+TYRE_MARGIN = 0.5
+ALLOWED_DERIVATIVE_NOISE = 0.05
+LARGEST_GAP = 0.05  # [s]
+SHORTEST_SEGMENT = 1.0  # [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotMotion:
+    """One contiguous piece on a regular grid after the wide filter; arrays along T.
+
+    Attributes:
+        rate: [Hz].
+        sampling: interval of joint_states [s].
+        position, velocity, acceleration, torque, torque_rate: joints (T, n, 2).
+        imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
+    """
+
+    recording: int
+    rate: float
+    sampling: float
+    time: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    torque: FloatArray
+    torque_rate: FloatArray
+    imu: FloatArray
+
+
+def read_motions(
+    robot: RobotDescription, recording: Recording, index: int, cutoff: float, with_torque: bool
+) -> list[RobotMotion]:
+    """Return the pieces of a recording that are long enough and whole.
+
+    Args:
+        robot: the robot that the recording was opened with.
+        recording: the recording; `index` is its number.
+        cutoff: of the channels' filter [Hz]; motions are filtered `PREFILTER_RATIO` times wider.
+        with_torque: samples without motor torque are left out.
+    """
+    motions = []
+    joints = recording.joint_states
+    n = robot.n
+    torque = joints.effort if joints.effort is not None else np.full_like(joints.position, np.nan)
+    signals = np.concatenate([joints.position.reshape(-1, 2 * n), torque.reshape(-1, 2 * n)], axis=1)
+    imu = np.full((len(signals), 3), np.nan)
+    if recording.imu is not None:
+        measured = np.column_stack([recording.imu.gyro[:, 2], recording.imu.acceleration[:, :2]])
+        for column in range(3):
+            imu[:, column] = np.interp(
+                joints.stamp, recording.imu.stamp, measured[:, column], left=np.nan, right=np.nan
+            )
+    signals = np.concatenate([signals, imu], axis=1)
+    rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
+    wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
+    step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
+    for stamps, values in pieces:
+        needed = 4 * n if with_torque else 2 * n
+        finite = np.isfinite(values[:, :needed]).all(axis=1)
+        for start, stop in _runs(np.asarray(finite, dtype=bool)):
+            if stamps[stop - 1] - stamps[start] < SHORTEST_SEGMENT:
+                continue
+            block = values[start:stop]
+            smooth = wide.smooth(np.where(np.isfinite(block), block, 0.0))
+            position = smooth[:, : 2 * n].reshape(-1, n, 2)
+            velocity = derivative(position, rate)
+            torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
+            keep = slice(None, None, step)
+            sensed = np.where(np.isfinite(block[:, 4 * n :]), smooth[:, 4 * n :], np.nan)
+            motions.append(
+                RobotMotion(
+                    recording=index,
+                    rate=rate / step,
+                    sampling=1.0 / rate,
+                    time=stamps[start:stop][keep],
+                    position=position[keep].copy(),
+                    velocity=velocity[keep].copy(),
+                    acceleration=derivative(velocity, rate)[keep].copy(),
+                    torque=torque[keep].copy(),
+                    torque_rate=derivative(torque, rate)[keep].copy(),
+                    imu=sensed[keep],
+                )
+            )
+    return motions
+
+
+def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> float:
+    """Return the largest cut-off at which differentiated encoder noise stays small against the motion [Hz].
+
+    White noise s of a joint angle at the rate f_s, differentiated twice and cut at f_c, has the variance
+    2 s^2 (2 pi)^4 f_c^5 / (5 f_s); it may reach a part of the largest accelerations recorded.
+    """
+    contact = robot.contact
+    # Slip stiffness 2 mu_p F_z / lambda_p over the relaxation length: the spring between wheel and ground, per unit mass.
+    stiffness = 2.0 * contact.mu_p * 9.81 / (contact.lambda_p * contact.relaxation_length)
+    cutoffs = [LARGEST_CUTOFF, TYRE_MARGIN * float(np.sqrt(stiffness)) / (2.0 * np.pi)]
+    for recording in recordings:
+        joints = recording.joint_states
+        rate = 1.0 / float(np.median(np.diff(joints.stamp)))
+        cutoffs.append(rate / 8.0)
+        slow = SignalFilter(rate, min(5.0, rate / 8.0))
+        for i in range(robot.n):
+            angle = joints.position[:, i, DRIVE]
+            usable = np.isfinite(angle)
+            if usable.sum() < 4 * slow.settling:
+                continue
+            angle = angle[usable]
+            noise = white_noise_level(angle)
+            acceleration = derivative(derivative(slow.smooth(angle), rate), rate)[
+                slow.settling : -slow.settling
+            ]
+            allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(acceleration)), 1e-3)
+            if noise > 0.0:
+                cutoffs.append((allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)
+    return max(min(cutoffs), SMALLEST_CUTOFF)
+
+
+def _runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """Start and stop of every run of true values."""
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
