@@ -87,6 +87,7 @@ class WhitenedRegression:
         # Robust weights lower the information; the evidence counts samples by weight.
         self.effective_rows = float(np.sum(self._root**2))
         sample_block = block[self._flat // problem.residual.shape[1]]
+        self._sample_block = sample_block
         edges = np.flatnonzero(np.diff(sample_block)) + 1
         bounds = [0, *edges.tolist(), self.rows]
         self.blocks = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
@@ -99,6 +100,10 @@ class WhitenedRegression:
         white = self.noise.whiten(values, self.problem.valid, self.problem.segment)
         flat = white.reshape(-1, *values.shape[2:])[self._flat]
         return flat * self._root.reshape(-1, *(1,) * (flat.ndim - 1))
+
+    def block_labels(self) -> list[int]:
+        """Labels of the blocks that hold usable rows, in the order of `blocks`."""
+        return [int(self._sample_block[piece.start]) for piece in self.blocks]
 
     def spread(self, rows: FloatArray) -> FloatArray:
         """Put values of the usable rows back in their place (T, C), zero elsewhere."""

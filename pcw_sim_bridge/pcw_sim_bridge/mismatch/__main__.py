@@ -1,0 +1,1 @@
+"""`mismatch`: compares recordings with a description and says what the model leaves out."""

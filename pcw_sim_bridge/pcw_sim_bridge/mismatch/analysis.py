@@ -1,0 +1,1 @@
+"""From recordings and a description to findings. (Being written by the lead.)"""

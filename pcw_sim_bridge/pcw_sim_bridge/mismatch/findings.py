@@ -1,0 +1,258 @@
+"""What an analysis found, as data: the report, the patched description and the summary are made of this alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from .regression_problem import FloatArray
+
+FORMAT = "pcw_mismatch/1"
+VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
+
+
+@dataclasses.dataclass(frozen=True)
+class InputFinding:
+    """A recording that went in. `role` is "fit" or "holdout"."""
+
+    path: str
+    sha256: str
+    duration: float
+    role: str
+    warnings: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelFinding:
+    """How far one channel is from its noise, with the description's numbers re-tuned within their tolerances.
+
+    Attributes:
+        rms: of the nominal residual (before any re-tuning), in `unit`.
+        noise_floor: rms of the noise, from what the chosen model leaves, in `unit`.
+        p_value: of the channel's residual being noise and tolerances alone.
+        flagged: whether it is not.
+    """
+
+    name: str
+    unit: str
+    rms: float
+    noise_floor: float
+    p_value: float
+    flagged: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class LocationFinding:
+    """Where recordings and model part."""
+
+    channels: tuple[str, ...]
+    casters: tuple[str, ...]
+    axis: str
+    intervals: tuple[tuple[float, float], ...]
+    region: Mapping[str, tuple[float, float]]
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterFinding:
+    """A number with its 95 % interval."""
+
+    value: float
+    unit: str
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectFinding:
+    """An effect that the description leaves out."""
+
+    name: str
+    target: tuple[str, ...]
+    probability: float
+    parameters: Mapping[str, ParameterFinding]
+    statement: str
+    ambiguous_with: tuple[str, ...]
+    experiment: str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class UnknownFinding:
+    """A leftover that no effect of the library explains."""
+
+    channel: str
+    depends_on: tuple[str, ...]
+    expression: str | None
+    share_explained: float
+
+
+@dataclasses.dataclass(frozen=True)
+class RetunedFinding:
+    """A number of the description that the recording moves, within its tolerance or (then a warning) beyond it."""
+
+    name: str
+    unit: str
+    nominal: float
+    value: float
+    low: float
+    high: float
+    tolerance: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FitFinding:
+    """Held-out errors before and after the patch.
+
+    Attributes:
+        source: what was held out, in words.
+        inverse_nrmse: of the measured side of the channels, before and after.
+        rollout: of forward simulation, by signal.
+        gap_closed: (before - after) / (before - floor).
+    """
+
+    source: str
+    inverse_nrmse: tuple[float, float]
+    rollout: Mapping[str, tuple[float, float]]
+    gap_closed: float
+
+
+@dataclasses.dataclass(frozen=True)
+class LadderFinding:
+    """One candidate set that was tried."""
+
+    description: str
+    gain: float
+    held_out_gain: float | None
+    outcome: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """A channel over time, for the figures; arrays (T,).
+
+    Attributes:
+        before: what the nominal model predicts; after: what the patched one predicts.
+        variable: the most telling variable to draw the residual against, its name in `variable_name`.
+    """
+
+    channel: str
+    unit: str
+    role: str
+    time: FloatArray
+    measured: FloatArray
+    before: FloatArray
+    after: FloatArray
+    variable_name: str
+    variable: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class Findings:
+    """Everything an analysis says."""
+
+    subject: str
+    verdict: str
+    inputs: tuple[InputFinding, ...]
+    channels: tuple[ChannelFinding, ...]
+    locations: tuple[LocationFinding, ...]
+    effects: tuple[EffectFinding, ...]
+    unknown: tuple[UnknownFinding, ...]
+    retuned: tuple[RetunedFinding, ...]
+    fit: FitFinding | None
+    ladder: tuple[LadderFinding, ...]
+    traces: tuple[Trace, ...]
+    notes: tuple[str, ...]
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of report.json (INTERFACES section 6; `retuned`, `ladder` and `notes` are additions)."""
+        return {
+            "format": FORMAT,
+            "verdict": self.verdict,
+            "inputs": [
+                {"path": i.path, "sha256": i.sha256, "duration_s": i.duration, "role": i.role, "warnings": list(i.warnings)}
+                for i in self.inputs
+            ],
+            "channels": [dataclasses.asdict(channel) for channel in self.channels],
+            "locations": [
+                {
+                    "channels": list(place.channels),
+                    "casters": list(place.casters),
+                    "axis": place.axis,
+                    "intervals_s": [list(interval) for interval in place.intervals],
+                    "region": {name: list(span) for name, span in place.region.items()},
+                    "place_m": None,
+                }
+                for place in self.locations
+            ],
+            "effects": [
+                {
+                    "name": effect.name,
+                    "target": list(effect.target),
+                    "probability": effect.probability,
+                    "parameters": {
+                        name: {"value": p.value, "unit": p.unit, "ci95": [p.low, p.high]}
+                        for name, p in effect.parameters.items()
+                    },
+                    "statement": effect.statement,
+                    "ambiguous_with": list(effect.ambiguous_with),
+                    "experiment": effect.experiment,
+                }
+                for effect in self.effects
+            ],
+            "unknown": [
+                {
+                    "channel": leftover.channel,
+                    "depends_on": list(leftover.depends_on),
+                    "expression": leftover.expression,
+                    "share_explained": leftover.share_explained,
+                }
+                for leftover in self.unknown
+            ],
+            "fit": {}
+            if self.fit is None
+            else {
+                "holdout": {
+                    "source": self.fit.source,
+                    "inverse_nrmse": list(self.fit.inverse_nrmse),
+                    "rollout": {name: list(pair) for name, pair in self.fit.rollout.items()},
+                    "gap_closed": self.fit.gap_closed,
+                }
+            },
+            "retuned": [
+                {
+                    "name": r.name, "unit": r.unit, "nominal": r.nominal, "value": r.value, "ci95": [r.low, r.high],
+                    "tolerance": r.tolerance,
+                }
+                for r in self.retuned
+            ],
+            "ladder": [dataclasses.asdict(step) for step in self.ladder],
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+    def summary(self) -> list[str]:
+        """Return five plain lines: subject, verdict, effects, held-out fit, warnings."""
+        verdict = {
+            "no_mismatch": "nothing is missing: what differs is within noise and tolerances",
+            "explained": "explained: the effects below account for the mismatch",
+            "partly_explained": "partly explained: the effects below, and a leftover that is not in the library",
+            "unexplained": "not explained by any effect of the library",
+            "insufficient_data": "not enough data to judge",
+        }[self.verdict]
+        found = " ".join(effect.statement for effect in self.effects) or "none"
+        for leftover in self.unknown:
+            found += f" Unknown: {leftover.channel} depends on {', '.join(leftover.depends_on)}."
+        if self.fit is None:
+            fit = "no held-out data"
+        else:
+            before, after = self.fit.inverse_nrmse
+            fit = f"NRMSE {before:.3f} before, {after:.3f} after; {100 * self.fit.gap_closed:.0f} % of the gap closed ({self.fit.source})"
+        warnings = sum(len(i.warnings) for i in self.inputs)
+        return [
+            f"Subject:   {self.subject}",
+            f"Verdict:   {verdict}",
+            f"Effects:   {found}",
+            f"Held out:  {fit}",
+            f"Warnings:  {warnings} about the recordings; {self.seconds:.1f} s",
+        ]
