@@ -1,0 +1,265 @@
+"""Is anything left, and what does it depend on? Asked before a name is given out.
+
+After the joint fit every channel's residual is offered a smooth function of one measured variable at a time (piecewise
+linear, or a Fourier series for an angle). The function is fitted together with the effects and the tolerances, so that
+it cannot live on what they explain already, and it counts only as far as it lowers the error of held-out blocks. A
+named effect that such a function makes redundant, and of which it explains more, is not that effect: the name is
+withdrawn and the dependence reported instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from .evidence_selection import EffectSearch
+from .noise_model import robust_deviation
+from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .whitened_regression import Instance, WhitenedRegression
+
+HAT_KNOTS = 9
+HARMONICS = 3
+# A function of one variable must take this part of what is left of a channel to be worth a report.
+SMALLEST_SHARE = 0.10
+SMALLEST_GAIN = 10.0  # nats, on top of the threshold of the names
+
+
+@dataclasses.dataclass(frozen=True)
+class Leftover:
+    """A dependence that no named effect explains.
+
+    Attributes:
+        share: part of the channel's remaining mean square that the dependence explains on held-out blocks.
+        gain: nats on held-out blocks.
+        curve: the function, as (variable (N,), contribution (N,)) for the report.
+    """
+
+    channel: str
+    variable: str
+    share: float
+    gain: float
+    curve: tuple[FloatArray, FloatArray]
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenSetResult:
+    """What is left after the named effects.
+
+    Attributes:
+        leftovers: per channel the leading dependence, strongest first.
+        vetoed: instances whose name is withdrawn, with the variable that explains them better.
+        floor: rms of each channel that no function of the measured variables explains (C,).
+    """
+
+    leftovers: tuple[Leftover, ...]
+    vetoed: tuple[tuple[Instance, str], ...]
+    floor: FloatArray
+
+
+def smooth_basis(values: FloatArray, periodic: bool) -> tuple[FloatArray, FloatArray]:
+    """Functions of one variable (T, K) without the constant one, and the knots they stand on."""
+    if periodic:
+        harmonics = np.arange(1, HARMONICS + 1)
+        angles = values[:, None] * harmonics
+        return np.concatenate([np.cos(angles), np.sin(angles)], axis=1), np.linspace(-np.pi, np.pi, 61)
+    # Quantiles by rank among distinct levels: a recording that holds a few speeds has most samples on plateaus.
+    low, high = np.quantile(values, [0.005, 0.995])
+    if high - low < 1e-12 * max(abs(low), abs(high), 1e-300):
+        return np.zeros((len(values), 0)), np.array([low])
+    quantiles = np.quantile(values, np.linspace(0.01, 0.99, HAT_KNOTS))
+    even = np.linspace(low, high, HAT_KNOTS)
+    knots = 0.5 * (quantiles + even)
+    clipped = np.clip(values, knots[0], knots[-1])
+    hats = np.stack([np.interp(clipped, knots, row) for row in np.eye(HAT_KNOTS)], axis=1)
+    return hats - hats.mean(axis=0), knots
+
+
+class OpenSetTest:
+    """Tests the residual of a chosen set for dependences on the problem's variables."""
+
+    def __init__(self, search: EffectSearch, instances: Sequence[Instance]) -> None:
+        self.search = search
+        self.problem: RegressionProblem = search.problem
+        self.instances = tuple(instances)
+        self.residual = search.residual_of(self.instances)
+        self.bases = self._bases()
+        self.regression = search.whiten_at(self._unexplained())
+
+    def _bases(self) -> dict[tuple[int, str], tuple[FloatArray, FloatArray]]:
+        """Basis columns (T, K) and knots by channel and variable."""
+        bases = {}
+        for name, values in self.problem.variables.items():
+            functions, knots = smooth_basis(values, periodic=name.startswith(("steer_angle", "drive_angle")))
+            if functions.shape[1]:
+                for channel in range(len(self.problem.channels)):
+                    bases[channel, name] = (functions, knots)
+        return bases
+
+    def _unexplained(self) -> FloatArray:
+        """Residual (T, C) after additive functions of all variables: the noise to judge every single one by."""
+        left = self.residual.copy()
+        for channel in range(left.shape[1]):
+            columns = [functions for (c, _), (functions, _) in self.bases.items() if c == channel]
+            valid = self.problem.valid[:, channel]
+            if not columns or not valid.any():
+                continue
+            stacked = np.concatenate([*columns, np.ones((len(left), 1))], axis=1)
+            size = np.maximum(np.sqrt(np.mean(stacked[valid] ** 2, axis=0)), 1e-300)
+            scaled = stacked[valid] / size
+            gram = scaled.T @ scaled + 1e-3 * len(scaled) * np.eye(scaled.shape[1])
+            left[:, channel] -= stacked / size @ np.linalg.solve(gram, scaled.T @ left[valid, channel])
+        return left
+
+    def run(self, threshold: float) -> OpenSetResult:
+        """Find the leading dependence of every channel, and the names that do not survive it."""
+        leftovers = []
+        for channel in range(len(self.problem.channels)):
+            best = self._leading(channel, self.instances, threshold)
+            if best is not None:
+                leftovers.append(best)
+        leftovers.sort(key=lambda leftover: -leftover.gain)
+        vetoed = self._vetoes(leftovers, threshold)
+        floor = np.array(
+            [
+                robust_deviation(self._unexplained()[self.problem.valid[:, c], c])
+                if self.problem.valid[:, c].any()
+                else 0.0
+                for c in range(len(self.problem.channels))
+            ]
+        )
+        return OpenSetResult(tuple(leftovers), tuple(vetoed), floor)
+
+    def _leading(self, channel: int, instances: Sequence[Instance], threshold: float) -> Leftover | None:
+        best: Leftover | None = None
+        for (c, name), (functions, knots) in self.bases.items():
+            if c != channel:
+                continue
+            gain, share, curve = self._dependence(channel, name, functions, knots, instances)
+            passes = gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE
+            if passes and (best is None or gain > best.gain):
+                best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
+        return best
+
+    def _dependence(
+        self, channel: int, name: str, functions: FloatArray, knots: FloatArray, instances: Sequence[Instance]
+    ) -> tuple[float, float, tuple[FloatArray, FloatArray]]:
+        """Held-out gain [nats] and share of a function of one variable in one channel, fitted beside the set."""
+        augmented = AugmentedFit(self.regression, instances, channel, functions)
+        before, after = augmented.held_out_errors()
+        weights = augmented.weights()
+        valid = self.problem.valid[:, channel]
+        total = float(np.sum(self.residual[valid, channel] ** 2))
+        errors = augmented.held_out_residuals(self.problem, self.search.block, channel)
+        share = 1.0 - float(np.sum(errors[valid] ** 2)) / max(total, 1e-300)
+        order = np.argsort(self.problem.variables[name])
+        if name.startswith(("steer_angle", "drive_angle")):
+            grid = knots
+            curve = smooth_basis(grid, periodic=True)[0] @ weights
+        else:
+            grid = np.linspace(knots[0], knots[-1], 61)
+            shape = functions[order] @ weights
+            curve = np.interp(grid, self.problem.variables[name][order], shape)
+        return 0.5 * (before - after), max(share, 0.0), (grid, curve)
+
+    def _vetoes(self, leftovers: Sequence[Leftover], threshold: float) -> list[tuple[Instance, str]]:
+        """Instances that a leading dependence makes redundant and outdoes."""
+        vetoed = []
+        names = [channel.name for channel in self.problem.channels]
+        for leftover in leftovers:
+            channel = names.index(leftover.channel)
+            functions, _ = self.bases[channel, leftover.variable]
+            for instance in self.instances:
+                if leftover.variable in self.problem.terms[instance.term].arguments:
+                    continue
+                others = [i for i in self.instances if i != instance]
+                with_both = AugmentedFit(self.regression, self.instances, channel, functions).log_evidence()
+                without = AugmentedFit(self.regression, others, channel, functions).log_evidence()
+                own = (
+                    self.regression.fit(self.instances).log_evidence
+                    - self.regression.fit(others).log_evidence
+                )
+                captured = without - self.regression.fit(others).log_evidence
+                if with_both - without < threshold and own < 0.5 * captured:
+                    vetoed.append((instance, leftover.variable))
+        return vetoed
+
+
+class AugmentedFit:
+    """A set of effects and a free function of one variable in one channel, fitted jointly."""
+
+    def __init__(
+        self,
+        regression: WhitenedRegression,
+        instances: Sequence[Instance],
+        channel: int,
+        functions: FloatArray,
+    ) -> None:
+        self.regression = regression
+        self.instances = tuple(instances)
+        problem = regression.problem
+        self.columns = np.zeros((*problem.residual.shape, functions.shape[1]))
+        self.columns[:, channel] = functions
+        self.design = np.concatenate(
+            [regression.design(self.instances), regression.whiten_columns(self.columns)], axis=1
+        )
+        valid = problem.valid[:, channel]
+        size = float(np.sqrt(np.mean(problem.residual[valid, channel] ** 2))) if valid.any() else 1.0
+        spread = np.maximum(np.sqrt(np.mean(functions**2, axis=0)), 1e-300)
+        self.own = functions.shape[1]
+        self.deviations = np.concatenate([regression.deviations(self.instances), size / spread])
+
+    def _grams(self) -> FloatArray:
+        stacked = np.concatenate([self.design, self.regression.target[:, None]], axis=1)
+        return np.stack([stacked[piece].T @ stacked[piece] for piece in self.regression.blocks])
+
+    def _posterior(self, gram: FloatArray, count: int) -> FloatArray:
+        precision = gram[:count, :count] + np.diag(1.0 / self.deviations[:count] ** 2)
+        solution: FloatArray = np.linalg.solve(precision, gram[:count, -1])
+        return solution
+
+    def held_out_errors(self) -> tuple[float, float]:
+        """Squared whitened error on held-out blocks without and with the function."""
+        grams = self._grams()
+        total = grams.sum(axis=0)
+        base = len(self.deviations) - self.own
+        errors = [0.0, 0.0]
+        for gram in grams:
+            for which, count in enumerate((base, len(self.deviations))):
+                mean = self._posterior(total - gram, count)
+                keep = np.r_[np.arange(count), gram.shape[0] - 1]
+                extended = np.append(-mean, 1.0)
+                errors[which] += float(extended @ gram[np.ix_(keep, keep)] @ extended)
+        return errors[0], errors[1]
+
+    def held_out_residuals(self, problem: RegressionProblem, block: IntArray, channel: int) -> FloatArray:
+        """Residual of the channel in its own unit (T,), every block predicted from the others."""
+        grams = self._grams()
+        total = grams.sum(axis=0)
+        parts = [problem.nuisance_columns()]
+        for instance in self.instances:
+            parts.append(
+                problem.terms[instance.term].columns(dict(instance.shape))[..., list(instance.active)]
+            )
+        plain = np.concatenate([*parts, self.columns], axis=2)[:, channel]
+        residual = problem.residual[:, channel].copy()
+        used = self.regression.block_labels()
+        for label, gram in zip(used, grams, strict=True):
+            rows = block == label
+            residual[rows] -= plain[rows] @ self._posterior(total - gram, len(self.deviations))
+        return residual
+
+    def weights(self) -> FloatArray:
+        """Coefficients of the function, from all blocks."""
+        return self._posterior(self._grams().sum(axis=0), len(self.deviations))[-self.own :]
+
+    def log_evidence(self) -> float:
+        """Evidence of set and function, comparable with that of the regression's own fits."""
+        gram = self._grams().sum(axis=0)
+        scaled = gram[:-1, :-1] * np.outer(self.deviations, self.deviations) + np.eye(len(self.deviations))
+        moment = gram[:-1, -1] * self.deviations
+        factor = np.linalg.cholesky(scaled)
+        half = np.linalg.solve(factor, moment)
+        rss = float(gram[-1, -1] - half @ half)
+        return -float(np.sum(np.log(np.diag(factor)))) - 0.5 * rss - sum(i.occam for i in self.instances)
