@@ -95,6 +95,8 @@ class EffectSearch:
         self.progress = progress
         self.block: IntArray = contiguous_blocks(problem.segment, self.settings.blocks)
         self.ladder: list[LadderStep] = []
+        # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
+        self.noise_gain = (0.0, 1.0)
 
     def run(self) -> Selection:
         """Grow, calibrate, prune."""
@@ -383,12 +385,19 @@ class EffectSearch:
             if exchange is not None and not any((i.term, i.shape) in rejected for i in exchange[1]):
                 self.progress(exchange[0])
                 instances = exchange[1]
-        regression = self.whiten_at(self.residual_of(instances))
-        fit = regression.fit(instances)
-        losses, held_out, _ = self.judge(regression, instances, fit)
-        for index, instance in enumerate(instances):
-            self.ladder.append(LadderStep(self.label(instance), losses[index], held_out[index], "named"))
-        return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), tuple(self.ladder))
+        return self.conclude(instances, threshold)
+
+    def conclude(self, instances: Sequence[Instance], threshold: float) -> Selection:
+        """Settle on a set: noise, fit and figures as they are with just these effects."""
+        chosen = tuple(instances)
+        regression = self.whiten_at(self.residual_of(chosen))
+        fit = regression.fit(chosen)
+        losses, held_out, _ = self.judge(regression, chosen, fit)
+        named = [
+            LadderStep(self.label(instance), losses[index], held_out[index], "named")
+            for index, instance in enumerate(chosen)
+        ]
+        return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), (*self.ladder, *named))
 
     def judge(
         self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
