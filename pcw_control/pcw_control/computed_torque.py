@@ -26,6 +26,7 @@ import math
 import numpy as np
 
 from pcw_description.augmented_object_model import AugmentedObjectModel
+from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import (
     forward_kinematics_kernel,
     joint_matrix_blocks,
@@ -160,6 +161,8 @@ class ComputedTorque:
         self._B = joint_matrix_blocks(robot)
         self._B_inverse = np.linalg.inv(self._B)
         self._speed_limit = robot.speed_limit * self.parameters.joint_speed_fraction
+        gain = self.parameters.integral_gain
+        self._largest_integral = np.array(self.parameters.integral_limit) / gain if gain > 0.0 else np.zeros(3)
 
     def step(
         self,
@@ -215,8 +218,7 @@ class ComputedTorque:
         e_dot = V_d - V
         e = state.error_integral
         if not saturated and p.integral_gain > 0.0:
-            largest = np.array(p.integral_limit) / p.integral_gain
-            e = np.clip(e + e_dot * dt, -largest, largest)
+            e = np.minimum(np.maximum(e + e_dot * dt, -self._largest_integral), self._largest_integral)
         return ComputedTorqueState(V_d, e), V_dot_d + p.integral_gain * e + p.velocity_gain * e_dot
 
     def _towards_point(
@@ -234,8 +236,8 @@ class ComputedTorque:
 
     def _joint_speed_factor(self, A: FloatArray, twist: FloatArray, slack: float = 1.0) -> float:
         """Return the factor up to 1 that keeps B^-1 A V within the joints' speed limits."""
-        joint_velocity = np.einsum("nij,nj->ni", self._B_inverse, (A @ twist).reshape(self._n, 2))
-        return 1.0 / max(1.0, float(np.max(np.abs(joint_velocity) / (self._speed_limit * slack))))
+        ratio = _largest_joint_speed(A, twist, self._B_inverse, self._speed_limit)
+        return 1.0 / max(1.0, ratio / slack)
 
     def _check(
         self, measurement: ComputedTorqueMeasurement, reference: TwistReference | TrajectoryPoint, dt: float
@@ -255,6 +257,19 @@ class ComputedTorque:
         for name, values in needed.items():
             if values.shape != (3,) or not np.isfinite(values).all():
                 raise ControlError(f"{name} = {values!r} is not allowed; allowed: three finite numbers")
+
+
+@compiled
+def _largest_joint_speed(A, twist, B_inverse, speed_limit):  # type: ignore[no-untyped-def]
+    """Return the largest of the joint speeds B^-1 A V relative to their limits (n, 2)."""
+    largest = 0.0
+    for i in range(len(B_inverse)):
+        along = A[2 * i, 0] * twist[0] + A[2 * i, 1] * twist[1] + A[2 * i, 2] * twist[2]
+        across = A[2 * i + 1, 0] * twist[0] + A[2 * i + 1, 1] * twist[1] + A[2 * i + 1, 2] * twist[2]
+        for j in range(2):
+            speed = abs(B_inverse[i, j, 0] * along + B_inverse[i, j, 1] * across)
+            largest = max(largest, speed / speed_limit[i, j])
+    return largest
 
 
 def _shrink(twist: FloatArray, linear: float, angular: float) -> float:

@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 
+from pcw_description.compiled import compiled
 from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .errors import ControlError
@@ -95,14 +96,32 @@ def limit_torque(
     """
     if not (np.isfinite(torque).all() and np.isfinite(joint_velocity).all() and math.isfinite(dt)):
         return LimitedTorque(np.zeros_like(limits.torque), fault=True, saturated=True)
-    fade = (1.0 - np.abs(joint_velocity) / limits.speed) / (1.0 - limits.foldback_start)
-    accelerates = torque * joint_velocity > 0.0
-    allowed = np.where(accelerates, torque * np.clip(fade, 0.0, 1.0), torque)
-    if limits.slew is not None:
-        change = limits.slew * max(dt, 0.0)
-        allowed = np.clip(allowed, previous_torque - change, previous_torque + change)
-    if limits.mode == "scale":
-        # Dividing by a ratio just above one may leave a joint a rounding error above its limit: the clip removes it.
-        allowed = allowed / max(1.0, float(np.max(np.abs(allowed) / limits.torque)))
-    allowed = np.clip(allowed, -limits.torque, limits.torque)
-    return LimitedTorque(allowed, fault=False, saturated=not np.array_equal(allowed, torque))
+    slew = math.inf if limits.slew is None else limits.slew * max(dt, 0.0)
+    allowed, saturated = _limited(
+        torque, joint_velocity, previous_torque, limits.torque, limits.speed, limits.foldback_start, slew,
+        limits.mode == "scale",
+    )
+    return LimitedTorque(allowed, fault=False, saturated=saturated)
+
+
+@compiled
+def _limited(torque, velocity, previous, largest, fastest, foldback_start, slew, scale):  # type: ignore[no-untyped-def]
+    """Return the torque (n, 2) after steps 2 to 4 and whether it differs from `torque`; one call in every control cycle."""
+    allowed = np.empty(torque.shape)
+    ratio = 1.0
+    for i in range(torque.shape[0]):
+        for j in range(2):
+            value = torque[i, j]
+            if value * velocity[i, j] > 0.0:
+                fade = (1.0 - abs(velocity[i, j]) / fastest[i, j]) / (1.0 - foldback_start)
+                value *= min(max(fade, 0.0), 1.0)
+            allowed[i, j] = min(max(value, previous[i, j] - slew), previous[i, j] + slew)
+            ratio = max(ratio, abs(allowed[i, j]) / largest[i, j])
+    saturated = False
+    for i in range(torque.shape[0]):
+        for j in range(2):
+            value = allowed[i, j] / ratio if scale else allowed[i, j]
+            # Dividing by a ratio just above one may leave a joint a rounding error above its limit: the clip removes it.
+            allowed[i, j] = min(max(value, -largest[i, j]), largest[i, j])
+            saturated = saturated or allowed[i, j] != torque[i, j]
+    return allowed, saturated

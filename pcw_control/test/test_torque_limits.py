@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -16,6 +16,7 @@ number = st.floats(allow_nan=True, allow_infinity=True)
 LIMITS = TorqueLimits.of_robot(THESIS)
 
 
+@settings(deadline=None)  # the first call compiles
 @given(
     arrays(float, (4, 2), elements=number), arrays(float, (4, 2), elements=number), number, st.sampled_from(["scale", "clip"])
 )
