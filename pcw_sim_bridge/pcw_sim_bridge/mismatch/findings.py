@@ -247,7 +247,8 @@ class Findings:
             fit = "no held-out data"
         else:
             before, after = self.fit.inverse_nrmse
-            fit = f"NRMSE {before:.3f} before, {after:.3f} after; {100 * self.fit.gap_closed:.0f} % of the gap closed ({self.fit.source})"
+            closed = f"{100 * self.fit.gap_closed:.0f} % of the gap closed"
+            fit = f"NRMSE {before:.3f} before, {after:.3f} after; {closed} ({self.fit.source})"
         warnings = sum(len(i.warnings) for i in self.inputs)
         return [
             f"Subject:   {self.subject}",

@@ -284,6 +284,12 @@ class ReducedPlant:
         if steer_angle is not None:
             self._wheels[:, PHI] = steer_angle
 
+    def set_motion(self, twist: FloatArray, joint_position: FloatArray, joint_velocity: FloatArray) -> None:
+        """Give the robot a twist (3,) in base_link and its joints angles and rates (n, 2), to go on from a recorded motion."""
+        self._body[_VX : _OMEGA + 1] = twist
+        self._wheels[:, RHO : PHI + 1] = joint_position
+        self._wheels[:, RHO_DOT : PHI_DOT + 1] = joint_velocity
+
     def step(self, motor_torque: FloatArray, steps: int = 1) -> None:
         """Advance by `steps` steps of dt with motor torques (n, 2) [N m] held.
 

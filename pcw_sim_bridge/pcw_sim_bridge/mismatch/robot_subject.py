@@ -1,0 +1,107 @@
+"""A robot on powered casters as a subject of analysis."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pcw_description.effects.effect import EffectInstance
+from pcw_description.effects.registry import get
+from pcw_description.recording import Recording
+from pcw_description.robot_description import STEER, RobotDescription, load_robot, robot_to_mapping
+
+from ..plants.reduced import ReducedPlant
+from .findings import InputFinding
+from .regression_problem import RegressionProblem
+from .robot_channels import RobotProblemBuilder
+from .robot_motion import choose_cutoff, read_motions
+from .rolling_model import ModelNumbers, twists
+from .subject import Opened
+
+ROLLOUT_WINDOW = 0.5  # [s]
+ROLLOUT_STEP = 1e-3  # [s]
+SIGNALS = ("v_x", "v_y", "omega")
+
+
+class RobotSubject:
+    """A robot; see `Subject`."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self.robot = robot
+        self.name = f"robot {robot.name}"
+        self._cutoff: float | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> RobotSubject:
+        """Load a `pcw_robot/1` file."""
+        return cls(load_robot(path))
+
+    def open(self, path: Path, role: str, topics: Mapping[str, str]) -> Opened:
+        """Read one rosbag2 folder or file."""
+        recording = Recording.open(path, self.robot, topics)
+        warnings = tuple(f"{warning.topic}: {warning.text}" for warning in recording.warnings)
+        return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, warnings))
+
+    def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
+        """Return the regression problem."""
+        recordings = [o.recording for o in opened]
+        if self._cutoff is None:
+            self._cutoff = choose_cutoff(self.robot, recordings)
+        return RobotProblemBuilder(self.robot, recordings, self._cutoff).build()
+
+    def unit(self, unit: str) -> str:
+        """Return a unit as it is."""
+        return unit
+
+    def statement(self, instance: EffectInstance) -> str:
+        """Return the plain sentence of an effect."""
+        return get(instance.name).statement(instance.target, instance.parameters)
+
+    def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> RobotSubject:
+        """Return the robot with effects added; numbers within their tolerance stay as the file has them."""
+        subject = RobotSubject(dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects)))
+        subject._cutoff = self._cutoff
+        return subject
+
+    def mapping(self) -> dict[str, Any]:
+        """Return the description as it stands in a file."""
+        return robot_to_mapping(self.robot)
+
+    def rollout(self, opened: Sequence[Opened]) -> dict[str, float]:
+        """Drive the reduced plant with the measured torques over windows, started at the measured motion.
+
+        The twist of the simulated robot at the end of each window is held against the recorded one, relative to how much the
+        twist changes over a window.
+        """
+        recordings = [o.recording for o in opened]
+        if self._cutoff is None:
+            self._cutoff = choose_cutoff(self.robot, recordings)
+        numbers = ModelNumbers.of(self.robot)
+        if np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3):
+            return {}
+        plant = ReducedPlant(self.robot, ROLLOUT_STEP)
+        apart, change = [], []
+        for index, recording in enumerate(recordings):
+            if recording.joint_states.effort is None:
+                return {}
+            for motion in read_motions(self.robot, recording, index, self._cutoff, with_torque=True):
+                angle = np.ascontiguousarray(motion.position[:, :, STEER])
+                twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
+                length = max(2, round(ROLLOUT_WINDOW * motion.rate))
+                steps = max(1, round(1.0 / (motion.rate * ROLLOUT_STEP)))
+                for start in range(0, len(motion.time) - length, length):
+                    plant.reset(steer_angle=angle[start])
+                    plant.set_motion(twist[start], motion.position[start], motion.velocity[start])
+                    for row in range(start, start + length):
+                        plant.step(motion.torque[row], steps)
+                    apart.append(plant.state().twist - twist[start + length])
+                    change.append(twist[start + length] - twist[start])
+        if not apart:
+            return {}
+        error = np.sqrt(np.mean(np.square(apart), axis=0))
+        size = np.sqrt(np.mean(np.square(change), axis=0))
+        return {name: float(error[k] / max(size[k], 1e-12)) for k, name in enumerate(SIGNALS)}
