@@ -26,6 +26,7 @@ from .findings import (
     Trace,
     UnknownFinding,
 )
+from .open_set import Leftover
 from .regression_problem import FloatArray, RegressionProblem
 from .subject import Opened, Subject
 from .whitened_regression import Fit, WhitenedRegression, predicted
@@ -37,6 +38,10 @@ FLAG_PROBABILITY = 1e-3
 LEAST_DURATION = 5.0  # [s]
 # Part of a recording held out at its end where none was given for it.
 HELD_OUT_PART = 0.3
+# A leftover is reported where it is this part of what its channel measures. Below it lie details that no description of a
+# real machine holds (the lean on its springs, the ripple of a filter); a tool that reports them on every healthy robot
+# says nothing.
+SMALLEST_LEFTOVER = 0.02
 # A number of the description is reported where it moves by this many of its own standard errors and a tenth of its
 # tolerance, or where its standard error is below this part of its tolerance: then the recordings have measured it.
 RETUNED_SIGNIFICANCE = 2.0
@@ -91,6 +96,7 @@ def analyse(
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
     explanation = explain(problem, np.random.default_rng(seed), settings, progress)
     instances = [effect_instance(named) for named in explanation.named]
+    leftovers = [leftover for leftover in explanation.leftovers if _matters(explanation, leftover)]
     retuned = _retuned(problem, explanation.fit)
     patched = subject.patched(instances, {r.name: r.value for r in retuned})
     progress("proving it on held-out data")
@@ -100,7 +106,7 @@ def analyse(
         (True, True): "partly_explained",
         (False, True): "unexplained",
         (False, False): "no_mismatch",
-    }[bool(instances), not explanation.complete]
+    }[bool(instances), bool(leftovers)]
     findings = Findings(
         subject=subject.name,
         verdict=verdict,
@@ -110,7 +116,7 @@ def analyse(
         effects=tuple(_effect_finding(subject, named, e) for named, e in zip(explanation.named, instances, strict=True)),
         unknown=tuple(
             UnknownFinding(left.channel, (left.variable,), None, float(min(left.share, 1.0)))
-            for left in explanation.leftovers
+            for left in leftovers
         ),
         retuned=retuned,
         fit=fit_finding,
@@ -119,7 +125,7 @@ def analyse(
             *_traces(problem, explanation.fit, "fit"),
             *(_traces(held_out_problem, held_out_fit, "holdout") if held_out else ()),
         ),
-        notes=_notes(explanation, retuned, bool(held_out)),
+        notes=_notes(explanation, retuned, bool(held_out), bool(leftovers)),
         seconds=time.monotonic() - begun,
     )
     return Analysis(findings, patched)
@@ -152,6 +158,16 @@ def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance
         ambiguous_with=tuple(dict.fromkeys(named.ambiguous_with)),
         experiment=effect.separating_experiment if named.ambiguous_with and effect.separating_experiment else None,
     )
+
+
+def _matters(explanation: Explanation, leftover: Leftover) -> bool:
+    """Whether a leftover is a noticeable part of what its channel measures."""
+    problem = explanation.search.problem
+    c = [channel.name for channel in problem.channels].index(leftover.channel)
+    valid = problem.valid[:, c]
+    residual = explanation.selection.regression.unwhitened_residual(explanation.fit)[valid, c]
+    size = float(np.sqrt(leftover.share * np.mean(residual**2)))
+    return size > SMALLEST_LEFTOVER * float(np.std(problem.measured[valid, c]))
 
 
 def _rms(values: FloatArray, valid: np.ndarray) -> FloatArray:
@@ -304,7 +320,7 @@ def _traces(problem: RegressionProblem, fit: Fit, role: str) -> tuple[Trace, ...
 
 
 def _notes(
-    explanation: Explanation, retuned: Sequence[RetunedFinding], has_holdout: bool
+    explanation: Explanation, retuned: Sequence[RetunedFinding], has_holdout: bool, unfinished: bool
 ) -> tuple[str, ...]:
     """What a reader has to know to judge the findings."""
     notes = []
@@ -323,9 +339,9 @@ def _notes(
             notes.append(f"{number.name} comes out {times:.1f} tolerances from the description: check it or its tolerance.")
     if not has_holdout:
         notes.append("No hold-out recording was given: the proof uses the end of the fitted ones.")
-    if not explanation.complete:
+    if unfinished:
         notes.append("What is left is not noise; the names above explain their part of it and no more.")
-    if explanation.refinement is not None:
+    if unfinished and explanation.refinement is not None:
         notes.append(f"First suspect for what is left: {explanation.refinement.describe()}.")
     share = float(problem.valid.mean())
     if share < 0.9:

@@ -24,9 +24,6 @@ HARMONICS = 3
 # A function of one variable must take this part of what is left of a channel to be worth a report.
 SMALLEST_SHARE = 0.10
 SMALLEST_GAIN = 10.0  # nats, on top of the threshold of the names
-# It must also be this part of the measured signal: below it lie details that no description of a real machine holds
-# (the lean on its springs, the ripple of a filter), and a tool that reports them on every healthy robot says nothing.
-SMALLEST_PART_OF_SIGNAL = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,16 +137,10 @@ class OpenSetTest:
             if c != channel:
                 continue
             gain, share, curve = self._dependence(channel, name, functions, knots, instances)
-            passes = gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE and self._matters(channel, share)
+            passes = gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE
             if passes and (best is None or gain > best.gain):
                 best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
         return best
-
-    def _matters(self, channel: int, share: float) -> bool:
-        """Whether a share of a channel's residual is a noticeable part of what the channel measures."""
-        valid = self.problem.valid[:, channel]
-        left = float(np.sqrt(share * np.mean(self.residual[valid, channel] ** 2)))
-        return left > SMALLEST_PART_OF_SIGNAL * float(np.std(self.problem.measured[valid, channel]))
 
     def _dependence(
         self, channel: int, name: str, functions: FloatArray, knots: FloatArray, instances: Sequence[Instance]
