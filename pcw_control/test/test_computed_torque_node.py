@@ -42,7 +42,7 @@ class Robot:
 
     def __init__(self, ros, target=(0.3, 0.0, 0.0)):
         self.ros, self.target = ros, target
-        self.time_ns, self.twist, self.position = 0, np.zeros(3), np.zeros((4, 2))
+        self.time_ns, self.twist, self.position = -PERIOD_NS, np.zeros(3), np.zeros((4, 2))
         self.commands, self.bad_velocity = [], False
         self.states = ros.peer.create_publisher(JointState, "joint_states", 10)
         self.cmd_vel = ros.peer.create_publisher(TwistStamped, "cmd_vel", 1)
@@ -103,6 +103,8 @@ def test_follows_cmd_vel_and_stamps_each_answer_with_its_question(ros):
     command = robot.commands[-1]
     assert command.name == NAMES and not command.velocity and not command.position
     assert 0 < stamp_to_ns(command.header.stamp) <= robot.time_ns
+    # Every measurement is answered, the first one at time zero too: a simulator in lock-step waits for it.
+    assert stamp_to_ns(robot.commands[0].header.stamp) == 0
     assert np.all(np.abs(robot.torque) <= THESIS.torque_limit)
     assert controller.interrupt() == 0
 

@@ -175,7 +175,7 @@ class SimulatedRobot:
         self._command = command
         self._command_ns = self.time_ns
 
-    def samples_now(self) -> Iterator[Sample]:
+    def _samples_now(self) -> Iterator[Sample]:
         """Read the sensors that are due at this instant; the joints come last, as a controller answers to them."""
         due = [schedule for schedule in self._schedules() if schedule.due_at(self.steps)]
         if not due:
@@ -199,14 +199,20 @@ class SimulatedRobot:
             schedule.advance()
 
     def advance(self) -> Iterator[Sample]:
-        """Advance to the next joint reading and yield all readings on the way, it being the last."""
+        """Advance to the next joint reading and yield all readings on the way, it being the last.
+
+        The first call yields those of time zero, and nothing has moved yet.
+        """
         target = self._control.next_step
+        if self.steps == target:
+            yield from self._samples_now()
+            return
         torque = self._torque()
         while self.steps < target:
             halt = min(target, *(schedule.next_step for schedule in self._schedules()))
             self.plant.step(torque, halt - self.steps)
             self.steps = halt
-            yield from self.samples_now()
+            yield from self._samples_now()
 
     def _torque(self) -> FloatArray:
         command = self._command

@@ -31,7 +31,7 @@ def simulated(robot=THESIS, **arguments):
 
 
 def run(robot, seconds):
-    samples = list(robot.samples_now())
+    samples = list(robot.advance())
     while robot.time_ns < round(seconds * 1e9):
         samples += robot.advance()
     return samples
@@ -57,7 +57,7 @@ def test_every_sensor_keeps_its_rate_without_drift(joints, imu, tracker):
 
 def test_samples_come_in_order_and_each_period_ends_with_the_joints():
     robot = simulated()
-    list(robot.samples_now())
+    list(robot.advance())
     for k in range(1, 50):
         period = list(robot.advance())
         assert [s.time_ns for s in period] == sorted(s.time_ns for s in period)
@@ -75,20 +75,20 @@ def test_a_seed_repeats_a_run_bit_by_bit_and_reset_does_too():
         return np.array(found)
 
     first = simulated(seed=3)
-    list(first.samples_now())
+    list(first.advance())
     a = drive(first)
     first.reset()
     assert first.time_ns == 0
-    list(first.samples_now())
+    list(first.advance())
     np.testing.assert_array_equal(a, drive(first))
     other = simulated(seed=4)
-    list(other.samples_now())
+    list(other.advance())
     assert not np.array_equal(a, drive(other))
 
 
 def test_torque_is_held_until_the_timeout_and_then_zero():
     robot = simulated(command_timeout=0.05)
-    list(robot.samples_now())
+    list(robot.advance())
     run(robot, 0.1)
     assert not robot.timed_out  # nothing was commanded yet
     robot.command(JointCommand(effort=np.tile([1.0, 0.0], (4, 1))))
@@ -103,7 +103,7 @@ def test_torque_is_held_until_the_timeout_and_then_zero():
 
 def test_zero_torque_by_command_of_none():
     robot = simulated()
-    list(robot.samples_now())
+    list(robot.advance())
     robot.command(JointCommand(effort=np.ones((4, 2))))
     list(robot.advance())
     robot.command(None)
@@ -113,7 +113,7 @@ def test_zero_torque_by_command_of_none():
 
 def test_velocity_commands_are_reached_and_held():
     robot = simulated()
-    list(robot.samples_now())
+    list(robot.advance())
     wanted = inverse_kinematics(THESIS, np.zeros(4), np.array([0.4, 0.0, 0.0]))
     for _ in range(1000):
         robot.command(JointCommand(velocity=wanted))

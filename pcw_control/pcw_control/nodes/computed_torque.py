@@ -93,7 +93,7 @@ class ComputedTorqueNode(LifecycleNode):
         self._twist: np.ndarray | None = None
         self._twist_ns = 0
         self._trajectory, self._trajectory_start_ns = None, 0
-        self._now_ns = 0
+        self._now_ns = -1  # before any stamp, zero included
         self._heard = time.monotonic()
 
     # --- Lifecycle --------------------------------------------------------------------------------------
@@ -224,6 +224,7 @@ class ComputedTorqueNode(LifecycleNode):
         repeated, self._now_ns = now_ns == self._now_ns, now_ns
         dt = self._watch.update(message.header.stamp)
         if repeated:
+            self._commands.publish(self._message)  # the same question, the same answer
             return
         try:
             self._control(message, dt)

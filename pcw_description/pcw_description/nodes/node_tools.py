@@ -317,6 +317,22 @@ class StampWatch:
         return None
 
 
+class Decimator:
+    """Says when a message is due at a lower rate than the one at which data come, without drift of the mean rate."""
+
+    def __init__(self, rate: float) -> None:
+        self._period = 1.0 / rate
+        self._elapsed = 0.0
+
+    def due(self, dt: float) -> bool:
+        """Whether, `dt` [s] after the call before, a message is due; of several missed ones only one is."""
+        self._elapsed += dt
+        if self._elapsed < self._period - 1e-6:  # stamps are whole nanoseconds, their differences are not
+            return False
+        self._elapsed = min(self._elapsed - self._period, self._period)
+        return True
+
+
 # --- Quality of service ---------------------------------------------------------------------------------
 
 

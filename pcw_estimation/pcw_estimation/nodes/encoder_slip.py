@@ -13,6 +13,7 @@ from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, S
 from pcw_description.nodes.node_tools import (
     SENSOR,
     SENSOR_SOURCE,
+    Decimator,
     StampWatch,
     declare,
     fill_joint_state,
@@ -51,7 +52,7 @@ class EncoderSlipNode(Node):
         encoder_slip.step(self.robot, self._thresholds, self._state, at_rest, at_rest, 0.0)
         self._output: encoder_slip.EncoderSlipOutput | None = None
         self._watch = StampWatch()
-        self._period, self._since_published = 1.0 / rate, 0.0
+        self._decimator = Decimator(rate)
         self._unusable, self._problems = 0, Problems(self)
         self._ever = np.zeros((self.robot.n, 2), dtype=bool)  # flagged since the last report
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
@@ -82,11 +83,7 @@ class EncoderSlipNode(Node):
         self._ever |= flagged
         if news:
             self._diagnostics.report()
-        if dt is None:
-            return
-        self._since_published += dt
-        if self._since_published + 0.5 * dt >= self._period:
-            self._since_published = 0.0
+        if dt is not None and self._decimator.due(dt):
             self._message.header.stamp = message.header.stamp
             fill_joint_state(self._message, position=output.ratio, velocity=output.slip)
             self._slip.publish(self._message)

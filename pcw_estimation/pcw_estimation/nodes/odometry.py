@@ -17,6 +17,7 @@ from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, S
 from pcw_description.nodes.node_tools import (
     SENSOR,
     SENSOR_SOURCE,
+    Decimator,
     StampWatch,
     declare,
     joint_state_arrays,
@@ -59,7 +60,7 @@ class OdometryNode(Node):
         self._parameters_of_odometry = odometry.OdometryParameters(method, memory)
         self._state = odometry.initial_state()
         self._watch = StampWatch(longest_gap)
-        self._period = 1.0 / rate
+        self._decimator = Decimator(rate)
         self._clear_mean()
         self._unusable, self._problems = 0, Problems(self)
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
@@ -97,8 +98,7 @@ class OdometryNode(Node):
         self._duration += dt
         self._moved += output.twist * dt
         self._moved_covariance += output.twist_covariance * dt**2
-        # Half a measurement's slack: rates that do not divide must not lose every other message.
-        if self._duration + 0.5 * dt >= self._period:
+        if self._decimator.due(dt):
             self._publish(message)
             self._clear_mean()
 

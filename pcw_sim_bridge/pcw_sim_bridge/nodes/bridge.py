@@ -56,8 +56,8 @@ class BridgeNode(Node):
 
         self.robot = robot
         self._simulated = SimulatedRobot(make_plant(plant, robot, dt, gui), seed, source, timeout, bandwidth)
-        for _ in self._simulated.advance():  # compiles everything before the clock starts
-            pass
+        for _ in range(3):  # compiles everything before the clock starts
+            list(self._simulated.advance())
         self._simulated.reset()
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
         self._outputs = BridgePublishers(self, robot)
@@ -131,9 +131,9 @@ class BridgeNode(Node):
         return True
 
     def _advance(self) -> None:
-        """Publish the readings of one control period; of time zero alone, the first time."""
+        """Publish the readings of one control period; those of time zero the first time."""
         try:
-            for sample in self._simulated.advance() if self._begun else self._simulated.samples_now():
+            for sample in self._simulated.advance():
                 self._outputs.publish(sample)
         except PlantError as error:
             self._fault = str(error)

@@ -26,7 +26,8 @@ class BridgePublishers:
         self._clock = node.create_publisher(Clock, "/clock", 1)
         self.joint_states = node.create_publisher(JointState, "joint_states", SENSOR_SOURCE)
         self._truth = node.create_publisher(Odometry, "ground_truth/odom", SENSOR_SOURCE)
-        self._imu = node.create_publisher(Imu, "imu/data", SENSOR_SOURCE)
+        # A robot without an IMU has no such topic, rather than a silent one.
+        self._imu = node.create_publisher(Imu, "imu/data", SENSOR_SOURCE) if robot.sensors.imu else None
         self._contacts = [
             node.create_publisher(WrenchStamped, f"contact/{name}/wrench", SENSOR_SOURCE) for name in robot.caster_names
         ]
@@ -45,7 +46,7 @@ class BridgePublishers:
             self._joint_message.header.stamp = stamp
             fill_joint_state(self._joint_message, reading.position, reading.velocity, reading.effort)
             self.joint_states.publish(self._joint_message)
-        elif isinstance(reading, ImuReading):
+        elif isinstance(reading, ImuReading) and self._imu is not None:
             message = self._imu_message
             message.header.stamp = stamp
             for vector, values in (
@@ -56,7 +57,7 @@ class BridgePublishers:
             self._imu.publish(message)
         elif isinstance(reading, TrackedPose):
             self._publish_truth(stamp, reading)
-        else:
+        elif isinstance(reading, PlantState):
             self._publish_contacts(stamp, reading)
 
     def _publish_truth(self, stamp, reading: TrackedPose) -> None:  # noqa: ANN001
