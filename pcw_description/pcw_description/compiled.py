@@ -38,7 +38,7 @@ def compiled(function: Function) -> Function:
     if not NUMBA_AVAILABLE:
         return function
     dispatcher = numba.njit(cache=True, error_model="numpy")(function)
-    _depend_on_all_kernels(dispatcher)
+    _depend_on_all_kernels(dispatcher, function.__module__)
     return dispatcher  # type: ignore[no-any-return]
 
 
@@ -47,14 +47,15 @@ def compiled_joint_torque(function: Function) -> Function:
     if not NUMBA_AVAILABLE:
         return function
     dispatcher: Any = compiled(function)
-    dispatcher.compile(JOINT_TORQUE_SIGNATURE)
-    dispatcher.disable_compile()
+    if dispatcher is not function:  # the same where NUMBA_DISABLE_JIT is set, to debug
+        dispatcher.compile(JOINT_TORQUE_SIGNATURE)
+        dispatcher.disable_compile()
     return dispatcher  # type: ignore[no-any-return]
 
 
-def _depend_on_all_kernels(dispatcher: Any) -> None:
+def _depend_on_all_kernels(dispatcher: Any, module: str) -> None:
     """Add the kernels of its own package and of this one, those it can call, to what the cache of `dispatcher` depends on."""
-    package = sys.modules.get(dispatcher.py_func.__module__.partition(".")[0])
+    package = sys.modules.get(module.partition(".")[0])
     folders = {str(Path(__file__).parent), *getattr(package, "__path__", ())}
     # No public name for this in numba; where it has gone, the cache is the usual one.
     cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
