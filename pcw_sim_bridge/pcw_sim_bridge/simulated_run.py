@@ -1,4 +1,4 @@
-"""A recording without a running graph: plant, sensors and a computed-torque controller in one loop, in simulated time."""
+"""A recording without a running graph: a simulated robot and a computed-torque controller in one loop, in simulated time."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from pcw_description.robot_description import FloatArray, RobotDescription
 from pcw_description.ros_messages import imu, joint_state, odometry, twist_stamped
 
 from .plants.plant import make_plant
-from .sensors import Encoders, read_imu, read_tracker
+from .sensors import ImuReading, JointReading
+from .simulated_robot import JointCommand, Sample, SimulatedRobot, TrackedPose
 
 CommandedTwist = Callable[[float], FloatArray]
-CONTROL_RATE = 500.0  # [Hz], of the controller; sensors have the rates of the robot file
+# A stamp of zero means "no stamp" in ROS, so recordings begin at one second [ns].
+START_NS = 1_000_000_000
 
 
 def record_run(
@@ -34,7 +36,7 @@ def record_run(
     plant_name: str = "reduced",
     controlled_as: RobotDescription | None = None,
 ) -> None:
-    """Drive a robot along a commanded twist and write the recording a real one would have left.
+    """Drive a robot along a commanded twist and write the recording that a real one would have left.
 
     Args:
         robot: the robot as it really is; its `physics` are at work.
@@ -43,63 +45,46 @@ def record_run(
         seed: of all sensor noise; the same seed gives the same bytes of data.
         path: folder of the recording, which must not exist.
         plant_name: see `make_plant`.
-        controlled_as: the robot that the controller and the joint readings believe in; default: `robot`.
+        controlled_as: the robot that the controller believes in; default: `robot`.
 
     Raises:
         RecordingError: `path` exists.
         PlantError: the plant cannot be made.
     """
     believed = controlled_as or robot
-    rng = np.random.default_rng(seed)
-    plant = make_plant(plant_name, robot)
+    simulated = SimulatedRobot(make_plant(plant_name, robot), seed)
     controller, state = ComputedTorque(believed), initial_state()
     limits = TorqueLimits.of_robot(believed)
-    encoders, reading = Encoders(believed), None
-    sensors = robot.sensors
-    every = {
-        "control": _steps(CONTROL_RATE, plant.dt),
-        "joints": _steps(sensors.encoders.rate, plant.dt),
-        "imu": _steps(sensors.imu.rate, plant.dt) if sensors.imu else 0,
-        "tracker": _steps(sensors.tracker.rate, plant.dt) if sensors.tracker else 0,
-    }
-    torque = np.zeros((robot.n, 2))
-    saturated = False
+    torque, saturated = np.zeros((robot.n, 2)), False
     try:
         with RecordingWriter(path, flush_interval=None) as writer:
-            for step in range(round(duration / plant.dt)):
-                truth = plant.state()
-                stamp = round(truth.time * 1e9) + 1_000_000_000
-                if step % every["joints"] == 0:
-                    reading = encoders.read(truth, reading, every["joints"] * plant.dt, rng)
-                    writer.write(
-                        "/joint_states",
-                        joint_state(
-                            stamp, robot.joint_names, reading.position, reading.velocity, reading.effort
-                        ),
-                    )
-                if sensors.imu and step % every["imu"] == 0:
-                    sensed = read_imu(sensors.imu, truth, rng)
-                    writer.write("/imu/data", imu(stamp, sensed.angular_velocity, sensed.linear_acceleration))
-                if sensors.tracker and step % every["tracker"] == 0:
-                    writer.write(
-                        "/ground_truth/odom",
-                        odometry(stamp, read_tracker(sensors.tracker, truth, rng), truth.twist),
-                    )
-                if step % every["control"] == 0 and reading is not None:
-                    target = commanded_twist(truth.time)
-                    writer.write("/cmd_vel", twist_stamped(stamp, target))
-                    measurement = ComputedTorqueMeasurement(
-                        reading.position, reading.velocity, np.zeros(3), saturated
-                    )
-                    dt = every["control"] * plant.dt
+            while simulated.time_ns < duration * 1e9:
+                for sample in simulated.advance():
+                    _write(writer, robot, sample)
+                    if not isinstance(sample.reading, JointReading):
+                        continue
+                    joints = sample.reading
+                    target = commanded_twist(sample.time_ns * 1e-9)
+                    measurement = ComputedTorqueMeasurement(joints.position, joints.velocity, np.zeros(3), saturated)
+                    dt = simulated.control_period
                     state, wanted = controller.step(state, measurement, TwistReference(target), dt)
-                    limited = limit_torque(limits, torque, wanted.torque, reading.velocity, dt)
+                    limited = limit_torque(limits, torque, wanted.torque, joints.velocity, dt)
                     torque, saturated = limited.torque, limited.saturated
+                    simulated.command(JointCommand(effort=torque))
+                    stamp = sample.time_ns + START_NS
+                    writer.write("/cmd_vel", twist_stamped(stamp, target))
                     writer.write("/joint_commands", joint_state(stamp, robot.joint_names, effort=torque))
-                plant.step(torque)
     finally:
-        plant.close()
+        simulated.close()
 
 
-def _steps(rate: float, dt: float) -> int:
-    return max(round(1.0 / (rate * dt)), 1)
+def _write(writer: RecordingWriter, robot: RobotDescription, sample: Sample) -> None:
+    """Write one reading on its topic; contact forces stay with the simulator, as on a real robot."""
+    stamp, reading = sample.time_ns + START_NS, sample.reading
+    if isinstance(reading, JointReading):
+        message = joint_state(stamp, robot.joint_names, reading.position, reading.velocity, reading.effort)
+        writer.write("/joint_states", message)
+    elif isinstance(reading, ImuReading):
+        writer.write("/imu/data", imu(stamp, reading.angular_velocity, reading.linear_acceleration))
+    elif isinstance(reading, TrackedPose):
+        writer.write("/ground_truth/odom", odometry(stamp, reading.pose, reading.truth.twist))
