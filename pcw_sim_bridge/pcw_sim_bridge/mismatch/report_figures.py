@@ -26,6 +26,7 @@ WINDOW = 5.0  # [s] of the close-up
 ENVELOPE_BINS = 700  # about one per pixel column
 SCATTER_POINTS = 1200
 CURVE_BINS = 24
+NEARLY_ALL = 0.9
 LONGEST_PAUSE = 0.05  # of the time shown; a longer pause between pieces is cut short
 RESOLUTION = 130  # dots per inch
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -119,6 +120,8 @@ def draw_trace(trace: Trace, stem: str, origin: float, places: Sequence[Location
     within = np.zeros(len(time), dtype=bool)
     for start, end in intervals:
         within |= (time >= start - origin) & (time <= end - origin)
+    if np.count_nonzero(within) > NEARLY_ALL * len(within):
+        within[:] = False  # a shade over everything tells nothing
     window = worst_window(line.shown, residuals["before"])
     subject = f"{trace.channel} ({'held out' if trace.role == 'holdout' else 'fitted'})"
     return TraceFigures(
