@@ -52,6 +52,9 @@ class BridgeNode(Node):
         declare(self, "lockstep", False, "wait for a command after each joint_states", read_only=True)
         declare(self, "lockstep_timeout", 1.0, "go on without a command after so long, real time", "s", (0.01, 3600.0))
         declare(self, "step_duration", 0.0, "what ~/step advances; 0 is one control period", "s", (0.0, 3600.0))
+        clock_rate = declare(
+            self, "clock_rate", 100.0, "rate of /clock, at most that of joint_states", "Hz", (1.0, 1e4), read_only=True
+        )
         declare(self, "start_paused", False, "wait for ~/pause with false, or ~/step", read_only=True)
 
         self.robot = robot
@@ -60,7 +63,7 @@ class BridgeNode(Node):
             list(self._simulated.advance())
         self._simulated.reset()
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
-        self._outputs = BridgePublishers(self, robot)
+        self._outputs = BridgePublishers(self, robot, clock_rate)
         self.create_subscription(JointState, "joint_commands", self._on_command, COMMAND)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)

@@ -16,13 +16,14 @@ from pcw_description.robot_description import LATERAL, LONGITUDINAL, RobotDescri
 
 from ..plants.plant import PlantState
 from ..sensors import ImuReading, JointReading
-from ..simulated_robot import Sample, TrackedPose
+from ..simulated_robot import NANOSECONDS, Sample, TrackedPose
 
 
 class BridgePublishers:
     """The bridge's publishers and their messages, made once and filled again and again."""
 
-    def __init__(self, node: Node, robot: RobotDescription) -> None:
+    def __init__(self, node: Node, robot: RobotDescription, clock_rate: float) -> None:
+        self._clock_period_ns, self._next_clock_ns = round(NANOSECONDS / clock_rate), 0
         self._clock = node.create_publisher(Clock, "/clock", 1)
         self.joint_states = node.create_publisher(JointState, "joint_states", SENSOR_SOURCE)
         self._truth = node.create_publisher(Odometry, "ground_truth/odom", SENSOR_SOURCE)
@@ -39,10 +40,10 @@ class BridgePublishers:
             message.header.frame_id = f"{name}_fork"  # turns with the heading, as the wheel frame does
 
     def publish(self, sample: Sample) -> None:
-        """Publish one reading; the joints are preceded by /clock, so that whoever answers knows the time."""
+        """Publish one reading; the joints are preceded by /clock where that is due, so that whoever answers knows the time."""
         stamp, reading = ns_to_stamp(sample.time_ns), sample.reading
         if isinstance(reading, JointReading):
-            self._clock.publish(Clock(clock=stamp))
+            self._publish_clock(sample.time_ns)
             self._joint_message.header.stamp = stamp
             fill_joint_state(self._joint_message, reading.position, reading.velocity, reading.effort)
             self.joint_states.publish(self._joint_message)
@@ -60,6 +61,13 @@ class BridgePublishers:
         elif isinstance(reading, PlantState):
             self._publish_contacts(stamp, reading)
 
+    def _publish_clock(self, time_ns: int) -> None:
+        if time_ns < self._next_clock_ns - self._clock_period_ns:
+            self._next_clock_ns = 0  # set back by a reset
+        if time_ns >= self._next_clock_ns:
+            self._next_clock_ns = time_ns - time_ns % self._clock_period_ns + self._clock_period_ns
+            self._clock.publish(Clock(clock=ns_to_stamp(time_ns)))
+
     def _publish_truth(self, stamp, reading: TrackedPose) -> None:  # noqa: ANN001
         message = self._truth_message
         message.header.stamp = stamp
@@ -71,6 +79,8 @@ class BridgePublishers:
         self._truth.publish(message)
 
     def _publish_contacts(self, stamp, truth: PlantState) -> None:  # noqa: ANN001
+        if not any(publisher.get_subscription_count() for publisher in self._contacts):
+            return  # n messages that no real robot sends: not made for nobody
         for i, (publisher, message) in enumerate(zip(self._contacts, self._contact_messages)):
             message.header.stamp = stamp
             force = message.wrench.force
