@@ -39,13 +39,19 @@ PATCHED = {
     "name": "thesis",
     "chassis": {"mass": 74.0, "com": [0.0, 0.0, 0.25]},
     "physics": [
-        {"name": "drive_coulomb_friction", "target": ["rear_left"], "parameters": {"coulomb": 0.412, "asymmetry": 0.0}},
+        {
+            "name": "drive_coulomb_friction",
+            "target": ["rear_left"],
+            "parameters": {"coulomb": 0.412, "asymmetry": 0.0},
+        },
         {"name": "ground_slope", "target": ["chassis"], "parameters": {"pitch": 0.0081}},
     ],
 }
 
 
-def make_trace(channel: str, unit: str, role: str, samples: int = 4000, rate: float = 120.0, size: float = 1.0) -> Trace:
+def make_trace(
+    channel: str, unit: str, role: str, samples: int = 4000, rate: float = 120.0, size: float = 1.0
+) -> Trace:
     """A drive with dry friction that the nominal model lacks: a sine of force, and a step at every reversal."""
     rng = np.random.default_rng(len(channel) + samples)
     clock = np.arange(samples) / rate
@@ -53,7 +59,17 @@ def make_trace(channel: str, unit: str, role: str, samples: int = 4000, rate: fl
     nominal = size * (1.8 * np.cos(0.9 * clock) + 2.4 * np.cos(2.3 * clock + 1.0))
     friction = 0.9 * size * np.tanh(speed / 0.05) * (1.0 + 0.7 * (clock > 0.6 * clock[-1]))
     measured = nominal + friction + 0.08 * size * rng.standard_normal(samples)
-    return Trace(channel, unit, role, clock, measured, nominal, nominal + 0.98 * friction, "drive speed [rad/s]", 8.0 * speed)
+    return Trace(
+        channel,
+        unit,
+        role,
+        clock,
+        measured,
+        nominal,
+        nominal + 0.98 * friction,
+        "drive speed [rad/s]",
+        8.0 * speed,
+    )
 
 
 def demo_findings(samples: int = 4000) -> Findings:
@@ -62,7 +78,13 @@ def demo_findings(samples: int = 4000) -> Findings:
         subject="thesis, recorded 2 times",
         verdict="partly_explained",
         inputs=(
-            InputFinding("runs/figure_8", "9f2c" * 16, 33.3, "fit", ("joint_states: 3 gaps, the longest 0.12 s at 14.20 s",)),
+            InputFinding(
+                "runs/figure_8",
+                "9f2c" * 16,
+                33.3,
+                "fit",
+                ("joint_states: 3 gaps, the longest 0.12 s at 14.20 s",),
+            ),
             InputFinding("runs/chirp.mcap", "03ab" * 16, 61.0, "holdout", ()),
         ),
         channels=(
@@ -74,7 +96,9 @@ def demo_findings(samples: int = 4000) -> Findings:
         ),
         locations=(
             LocationFinding(
-                ("chassis_force/x", "chassis_torque/z"), ("rear_left",), "drive",
+                ("chassis_force/x", "chassis_torque/z"),
+                ("rear_left",),
+                "drive",
                 ((1.0, 6.5), (12.25, 19.75), *((20.0 + k, 20.5 + k) for k in range(9))),
                 {"drive_speed": (0.4, 12.7), "steer_angle": (-3.1, 3.1)},
             ),
@@ -82,7 +106,9 @@ def demo_findings(samples: int = 4000) -> Findings:
         ),
         effects=(
             EffectFinding(
-                "drive_coulomb_friction", ("rear_left",), 0.99962,
+                "drive_coulomb_friction",
+                ("rear_left",),
+                0.99962,
                 {
                     "coulomb": ParameterFinding(0.41234, "N m", 0.4031, 0.4216),
                     "asymmetry": ParameterFinding(-0.00213, "N m", -0.0095, 0.0052),
@@ -92,21 +118,36 @@ def demo_findings(samples: int = 4000) -> Findings:
                 "drive at several constant speeds and reverse often; shift a payload to load the wheels unevenly",
             ),
             EffectFinding(
-                "ground_slope", ("chassis",), 0.941, {"pitch": ParameterFinding(0.0081, "rad", 0.0074, 0.0088)},
-                "The ground slopes by 8.1 mrad along x.", (), None,
+                "ground_slope",
+                ("chassis",),
+                0.941,
+                {"pitch": ParameterFinding(0.0081, "rad", 0.0074, 0.0088)},
+                "The ground slopes by 8.1 mrad along x.",
+                (),
+                None,
             ),
         ),
-        unknown=(UnknownFinding("chassis_torque/z", ("steer_angle", "drive_speed"), "0.21 sin(2 steer_angle)", 0.62),),
+        unknown=(
+            UnknownFinding(
+                "chassis_torque/z", ("steer_angle", "drive_speed"), "0.21 sin(2 steer_angle)", 0.62
+            ),
+        ),
         retuned=(
             RetunedFinding("chassis.mass", "kg", 74.0, 74.31, 74.02, 74.60, 0.74),
             RetunedFinding("front_left.wheel_radius", "m", 0.075, 0.07541, 0.07537, 0.07545, 7.5e-5),
             RetunedFinding("rear_right.steer_zero", "rad", 0.0, -0.0011, -0.0014, -0.0008, 0.002),
         ),
-        fit=FitFinding("runs/chirp.mcap", (0.673, 0.0596), {"pose/x": (0.412, 0.021), "pose/yaw": (0.013, 0.0151)}, 0.982),
+        fit=FitFinding(
+            "runs/chirp.mcap", (0.673, 0.0596), {"pose/x": (0.412, 0.021), "pose/yaw": (0.013, 0.0151)}, 0.982
+        ),
         ladder=tuple(
-            [LadderFinding("drive_coulomb_friction/rear_left", 1841.2, 422.0, "named"),
-             LadderFinding("ground_slope/chassis", 61.4, 18.8, "named"),
-             LadderFinding("drop drive_viscous_friction/rear_left", 0.9, -0.4, "below the threshold of 6.1")]
+            [
+                LadderFinding("drive_coulomb_friction/rear_left", 1841.2, 422.0, "named"),
+                LadderFinding("ground_slope/chassis", 61.4, 18.8, "named"),
+                LadderFinding(
+                    "drop drive_viscous_friction/rear_left", 0.9, -0.4, "below the threshold of 6.1"
+                ),
+            ]
             + [LadderFinding(f"add candidate_{k}", 12.0 / (k + 1), None, "tried") for k in range(14)]
         ),
         traces=(
@@ -114,7 +155,9 @@ def demo_findings(samples: int = 4000) -> Findings:
             make_trace("chassis_torque/z", "N m", "fit", samples, size=1.3),
             make_trace("chassis_force/x", "N", "holdout", samples, size=5.0),
         ),
-        notes=("Without a tracked pose, a common error of all wheel radii cannot be told from the gyro's scale.",),
+        notes=(
+            "Without a tracked pose, a common error of all wheel radii cannot be told from the gyro's scale.",
+        ),
         seconds=4.21,
     )
 
@@ -122,7 +165,19 @@ def demo_findings(samples: int = 4000) -> Findings:
 def minimal_findings(verdict: str = "no_mismatch", **changes: Any) -> Findings:
     """Nothing found."""
     nothing = Findings(
-        "axis", verdict, (InputFinding("a.csv", "0" * 64, 3.0, "fit", ()),), (), (), (), (), (), None, (), (), (), 0.5
+        "axis",
+        verdict,
+        (InputFinding("a.csv", "0" * 64, 3.0, "fit", ()),),
+        (),
+        (),
+        (),
+        (),
+        (),
+        None,
+        (),
+        (),
+        (),
+        0.5,
     )
     return dataclasses.replace(nothing, **changes)
 
@@ -137,26 +192,46 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 NUMBER, TEXT, FLAG = "number", "text", "flag"
 CONTRACT = {
-    "format": TEXT, "verdict": TEXT, "seconds": NUMBER,
+    "format": TEXT,
+    "verdict": TEXT,
+    "seconds": NUMBER,
     "inputs": [{"path": TEXT, "sha256": TEXT, "duration_s": NUMBER, "role": TEXT, "warnings": [TEXT]}],
-    "channels": [{"name": TEXT, "unit": TEXT, "rms": NUMBER, "noise_floor": NUMBER, "p_value": NUMBER, "flagged": FLAG}],
+    "channels": [
+        {"name": TEXT, "unit": TEXT, "rms": NUMBER, "noise_floor": NUMBER, "p_value": NUMBER, "flagged": FLAG}
+    ],
     "locations": [
         {
-            "channels": [TEXT], "casters": [TEXT], "axis": TEXT, "intervals_s": [(NUMBER, NUMBER)],
-            "region": {"*": (NUMBER, NUMBER)}, "place_m": {"?": {"x": NUMBER, "y": NUMBER, "radius": NUMBER}},
+            "channels": [TEXT],
+            "casters": [TEXT],
+            "axis": TEXT,
+            "intervals_s": [(NUMBER, NUMBER)],
+            "region": {"*": (NUMBER, NUMBER)},
+            "place_m": {"?": {"x": NUMBER, "y": NUMBER, "radius": NUMBER}},
         }
     ],
     "effects": [
         {
-            "name": TEXT, "target": [TEXT], "probability": NUMBER,
+            "name": TEXT,
+            "target": [TEXT],
+            "probability": NUMBER,
             "parameters": {"*": {"value": NUMBER, "unit": TEXT, "ci95": (NUMBER, NUMBER)}},
-            "statement": TEXT, "ambiguous_with": [TEXT], "experiment": {"?": TEXT},
+            "statement": TEXT,
+            "ambiguous_with": [TEXT],
+            "experiment": {"?": TEXT},
         }
     ],
-    "unknown": [{"channel": TEXT, "depends_on": [TEXT], "expression": {"?": TEXT}, "share_explained": NUMBER}],
+    "unknown": [
+        {"channel": TEXT, "depends_on": [TEXT], "expression": {"?": TEXT}, "share_explained": NUMBER}
+    ],
     # `source` (what was held out, in words) is an addition inside.
-    "fit": {"holdout": {"source": TEXT, "inverse_nrmse": (NUMBER, NUMBER), "rollout": {"*": (NUMBER, NUMBER)},
-                        "gap_closed": NUMBER}},
+    "fit": {
+        "holdout": {
+            "source": TEXT,
+            "inverse_nrmse": (NUMBER, NUMBER),
+            "rollout": {"*": (NUMBER, NUMBER)},
+            "gap_closed": NUMBER,
+        }
+    },
 }
 ADDITIONS = {"retuned", "ladder", "notes"}
 
@@ -215,7 +290,9 @@ def test_json_of_nothing_held_out_has_an_empty_fit(tmp_path: Path) -> None:
 
 
 def test_numpy_numbers_are_written_as_numbers(tmp_path: Path) -> None:
-    channel = ChannelFinding("gyro", "rad/s", np.float64(0.5), np.float32(0.25), np.float64(0.0), np.bool_(True))  # type: ignore[arg-type]
+    channel = ChannelFinding(
+        "gyro", "rad/s", np.float64(0.5), np.float32(0.25), np.float64(0.0), np.bool_(True)
+    )  # type: ignore[arg-type]
     patched = {"mass": np.float64(2.5), "com": (np.float64(0.0), 1), "table": np.eye(2)}
     write_report(minimal_findings(channels=(channel,)), patched, tmp_path / "out")
     content = read_strictly(tmp_path / "out" / "report.json")
@@ -256,7 +333,9 @@ def test_page_refers_to_nothing_outside_itself(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
     for outside in ("http:", "https:", "//cdn", "url(", "@import", "<script", "<iframe", "<object"):
         assert outside not in page, outside
-    sources = [part.split('"')[0] for attribute in (' src="', ' href="') for part in page.split(attribute)[1:]]
+    sources = [
+        part.split('"')[0] for attribute in (' src="', ' href="') for part in page.split(attribute)[1:]
+    ]
     assert len(sources) > 5
     assert all(source.startswith(("data:", "#")) for source in sources)
 
@@ -271,7 +350,7 @@ def test_every_figure_of_the_page_is_a_file_too(demo: Path) -> None:
 
 def test_page_says_what_was_found_before_any_table(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
-    body = page[page.index("<body"):]
+    body = page[page.index("<body") :]
     opening = body[: body.index("<table")]
     for said in (
         "Partly explained.",
@@ -283,23 +362,41 @@ def test_page_says_what_was_found_before_any_table(demo: Path) -> None:
         "98 %",
     ):
         assert said in opening, said
-    order = [body.index(f'<section id="{name}"') for name in ("effects", "fit", "channels", "locations", "figures", "ladder",
-                                                              "retuned", "inputs", "notes", "reading")]
+    order = [
+        body.index(f'<section id="{name}"')
+        for name in (
+            "effects",
+            "fit",
+            "channels",
+            "locations",
+            "figures",
+            "ladder",
+            "retuned",
+            "inputs",
+            "notes",
+            "reading",
+        )
+    ]
     assert order == sorted(order)
 
 
 def test_page_shows_numbers_with_the_digits_they_have(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
     for shown in (
-        "<td class=\"num\">0.4123</td><td class=\"num\">[0.4031, 0.4216]</td>",
+        '<td class="num">0.4123</td><td class="num">[0.4031, 0.4216]</td>',
         "[−0.0095, 0.0052]",
         "&gt; 99.9 %",
-        "N·m", "m/s²", "3 × 10⁻⁴¹", "&lt; 10⁻³⁰⁰",
+        "N·m",
+        "m/s²",
+        "3 × 10⁻⁴¹",
+        "&lt; 10⁻³⁰⁰",
         "beyond 3 tolerances",
         "worse",
     ):
         assert shown in page, shown
-    assert page.count('<span class="tag part">beyond 3 tolerances</span>') == 1, "only the radius moved by more than 3"
+    assert page.count('<span class="tag part">beyond 3 tolerances</span>') == 1, (
+        "only the radius moved by more than 3"
+    )
     assert page.count('<span class="tag bad">worse</span>') == 1, "only the rollout of the yaw got worse"
 
 
@@ -330,7 +427,12 @@ def test_text_from_files_is_escaped(tmp_path: Path) -> None:
     trace = dataclasses.replace(findings.traces[0], channel=evil, variable_name=evil, unit=evil)
     patched = {"physics": [{"name": evil}]}
     changed = dataclasses.replace(
-        findings, subject=evil, effects=(effect,), locations=(place,), traces=(trace,), notes=(evil,),
+        findings,
+        subject=evil,
+        effects=(effect,),
+        locations=(place,),
+        traces=(trace,),
+        notes=(evil,),
         inputs=(InputFinding(evil, evil, 1.0, "fit", (evil,)),),
     )
     page = write_report(changed, patched, tmp_path / "out").read_text(encoding="utf-8")
@@ -349,9 +451,14 @@ def test_incomplete_traces_are_drawn(tmp_path: Path) -> None:
         dataclasses.replace(whole, time=whole.time + 1.7e9),
         dataclasses.replace(whole, measured=np.full(4000, np.nan)),
         dataclasses.replace(whole, variable=np.zeros(4000)),
-        dataclasses.replace(whole, **{name: np.empty(0) for name in ("time", "measured", "before", "after", "variable")}),
         dataclasses.replace(
-            whole, **{name: getattr(whole, name)[:1] for name in ("time", "measured", "before", "after", "variable")}
+            whole, **{name: np.empty(0) for name in ("time", "measured", "before", "after", "variable")}
+        ),
+        dataclasses.replace(
+            whole,
+            **{
+                name: getattr(whole, name)[:1] for name in ("time", "measured", "before", "after", "variable")
+            },
         ),
     )
     write_report(minimal_findings(traces=traces), PATCHED, tmp_path / "out")
@@ -361,22 +468,39 @@ def test_incomplete_traces_are_drawn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        (report.number(95.108), "95.1"), (report.number(-3.1648), "−3.16"), (report.number(0.0), "0"),
-        (report.number(99.96), "100"), (report.number(24841.0), "24841"), (report.number(4.2e-5, 2), "4.2 × 10⁻⁵"),
-        (report.number(None), "–"), (report.number(math.nan), "–"), (report.number(-math.inf), "−∞"),
+        (report.number(95.108), "95.1"),
+        (report.number(-3.1648), "−3.16"),
+        (report.number(0.0), "0"),
+        (report.number(99.96), "100"),
+        (report.number(24841.0), "24841"),
+        (report.number(4.2e-5, 2), "4.2 × 10⁻⁵"),
+        (report.number(None), "–"),
+        (report.number(math.nan), "–"),
+        (report.number(-math.inf), "−∞"),
         (report.with_interval(203.5034, 202.91, 204.09), ("203.50", "[202.91, 204.09]")),
         (report.with_interval(95.1, 60.0, 130.0), ("95", "[60, 130]")),
         (report.with_interval(4.2e-5, 3.9e-5, 4.5e-5), ("42.0 × 10⁻⁶", "[39.0, 45.0] × 10⁻⁶")),
         (report.with_interval(1.0, 1.0, 1.0), ("1.000", "[1.000, 1.000]")),
         (report.with_interval(1.0, -math.inf, math.inf), ("1.000", "[−∞, ∞]")),
-        (report.probability(0.9999), "> 99.9 %"), (report.probability(0.97), "97.0 %"), (report.probability(0.5), "50 %"),
-        (report.change(0.673, 0.0596), "−91 %"), (report.change(0.013, 0.0151), "+16 %"),
-        (report.change(0.0, 0.0), "–"), (report.change(1.0, 1.0), "0.0 %"), (report.nats(-0.02), "0.0"),
+        (report.probability(0.9999), "> 99.9 %"),
+        (report.probability(0.97), "97.0 %"),
+        (report.probability(0.5), "50 %"),
+        (report.change(0.673, 0.0596), "−91 %"),
+        (report.change(0.013, 0.0151), "+16 %"),
+        (report.change(0.0, 0.0), "–"),
+        (report.change(1.0, 1.0), "0.0 %"),
+        (report.nats(-0.02), "0.0"),
         (report.words("drive_stribeck_friction"), "drive Stribeck friction"),
-        (report.percent(-0.0), "0.0 %"), (report.as_written(0.0750), "0.075"),
-        (report.seconds(24.841), "24.8 s"), (report.seconds(200.0), "3 min 20 s"), (report.seconds(7300.0), "2 h 1 min"),
-        (report.listed(["a", "b", "c"], "or"), "a, b or c"), (report.listed([]), ""),
-        (report.pretty_unit("N m s/rad"), "N·m·s/rad"), (report.pretty_unit("kg m^2"), "kg·m²"), (report.pretty_unit("1"), ""),
+        (report.percent(-0.0), "0.0 %"),
+        (report.as_written(0.0750), "0.075"),
+        (report.seconds(24.841), "24.8 s"),
+        (report.seconds(200.0), "3 min 20 s"),
+        (report.seconds(7300.0), "2 h 1 min"),
+        (report.listed(["a", "b", "c"], "or"), "a, b or c"),
+        (report.listed([]), ""),
+        (report.pretty_unit("N m s/rad"), "N·m·s/rad"),
+        (report.pretty_unit("kg m^2"), "kg·m²"),
+        (report.pretty_unit("1"), ""),
     ],
 )
 def test_numbers_in_words(text: object, shown: object) -> None:
@@ -447,7 +571,12 @@ def test_empty_folder_is_used_and_parents_are_made(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     assert write_report(minimal_findings(), PATCHED, tmp_path / "empty") == tmp_path / "empty" / "report.html"
     write_report(minimal_findings(), PATCHED, tmp_path / "a" / "b" / "c")
-    assert sorted(os.listdir(tmp_path / "a" / "b" / "c")) == ["figures", "report.html", "report.json", "robot_patched.yaml"]
+    assert sorted(os.listdir(tmp_path / "a" / "b" / "c")) == [
+        "figures",
+        "report.html",
+        "report.json",
+        "robot_patched.yaml",
+    ]
     assert os.listdir(tmp_path / "a" / "b") == ["c"]
 
 
@@ -474,7 +603,9 @@ def test_folder_with_other_things_is_refused_even_with_force(tmp_path: Path) -> 
 def test_earlier_report_is_replaced_only_with_force(tmp_path: Path) -> None:
     out = tmp_path / "out"
     write_report(minimal_findings(traces=(make_trace("gyro", "rad/s", "fit"),)), PATCHED, out)
-    with pytest.raises(MismatchError, match="out: the folder holds an earlier report; replace it with --force"):
+    with pytest.raises(
+        MismatchError, match="out: the folder holds an earlier report; replace it with --force"
+    ):
         check_output(out)
     write_report(minimal_findings(), None, out, force=True)
     assert contents(out) == ["figures", "report.html", "report.json"], "nothing of the earlier report is left"
@@ -521,7 +652,9 @@ def test_interrupted_run_leaves_nothing(
     assert os.listdir(tmp_path) == []
 
 
-def test_interrupted_replacement_keeps_the_earlier_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_replacement_keeps_the_earlier_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out"
     write_report(demo_findings(), PATCHED, out)
     earlier = {path: (out / path).read_bytes() for path in contents(out) if (out / path).is_file()}
@@ -538,7 +671,11 @@ def test_interrupted_replacement_keeps_the_earlier_report(tmp_path: Path, monkey
     renamed = Path.rename
 
     def fail_to_move_in(self: Path, target: Path) -> Path:
-        if self.name.endswith(".partial") and target == out and (self / "report.html").read_bytes() != earlier["report.html"]:
+        if (
+            self.name.endswith(".partial")
+            and target == out
+            and (self / "report.html").read_bytes() != earlier["report.html"]
+        ):
             raise OSError(28, "No space left on device")
         return renamed(self, target)
 
@@ -573,18 +710,42 @@ def open_in_chromium(page: Path, folder: Path) -> tuple[str, str, list[dict[str,
     network = folder / "network.json"
     done = subprocess.run(
         [
-            chromium, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-            "--disable-background-networking", "--disable-component-update", "--disable-sync",
-            f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr", "--v=0", f"--log-net-log={network}",
-            "--host-resolver-rules=MAP * ~NOTFOUND", "--virtual-time-budget=3000", "--dump-dom", page.as_uri(),
+            chromium,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-quic",
+            "--no-first-run",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--disable-sync",
+            f"--user-data-dir={folder / 'profile'}",
+            "--enable-logging=stderr",
+            "--v=0",
+            f"--log-net-log={network}",
+            "--host-resolver-rules=MAP * ~NOTFOUND",
+            "--virtual-time-budget=3000",
+            "--dump-dom",
+            page.as_uri(),
         ],
-        capture_output=True, text=True, timeout=120, check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
     )
     log = json.loads(network.read_text())
     begun = log["constants"]["logEventTypes"]["URL_REQUEST_START_JOB"]
-    started = [event["params"] for event in log["events"] if event["type"] == begun and "url" in event.get("params", {})]
+    started = [
+        event["params"]
+        for event in log["events"]
+        if event["type"] == begun and "url" in event.get("params", {})
+    ]
     # The browser's own (its clock, its updates) do not come from an origin; those of a file come from the origin "null".
-    requests = [r for r in started if r.get("initiator") != "not an origin" and not r["url"].startswith(("data:", "file:"))]
+    requests = [
+        r
+        for r in started
+        if r.get("initiator") != "not an origin" and not r["url"].startswith(("data:", "file:"))
+    ]
     return done.stdout, done.stderr, requests
 
 
@@ -600,7 +761,9 @@ def test_browser_shows_the_page_without_console_message_or_request(demo: Path, t
 def test_browser_test_can_fail(tmp_path: Path) -> None:
     """A page that complains and fetches is seen to do both."""
     page = tmp_path / "bad.html"
-    page.write_text("<html><body><img src='http://127.0.0.1:9/x.png'><script>console.error('complaint')</script></body></html>")
+    page.write_text(
+        "<html><body><img src='http://127.0.0.1:9/x.png'><script>console.error('complaint')</script></body></html>"
+    )
     _, log, requests = open_in_chromium(page, tmp_path)
     assert [line for line in log.splitlines() if "CONSOLE" in line and "complaint" in line]
     assert [r["url"] for r in requests if r["url"].startswith("http://127.0.0.1:9/")]
