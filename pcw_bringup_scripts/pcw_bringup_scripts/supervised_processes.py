@@ -64,7 +64,7 @@ class Children:
             # A session of its own: Ctrl-C in the terminal reaches us alone, and we end the children in order.
             process = subprocess.Popen(
                 command, env=self._environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                start_new_session=True, preexec_fn=_end_with_the_parent,  # noqa: PLW1509 - no threads here
+                start_new_session=True, preexec_fn=_prepare,  # noqa: PLW1509 - no threads here
             )
         child = Child(name, process, log)
         self._children.append(child)
@@ -106,7 +106,9 @@ def wait_for_end(children: Children, last: Child, deadline: float) -> None:
     children.check()
 
 
-def _end_with_the_parent() -> None:
-    """Ask Linux to interrupt this child when its parent is killed, so that no simulation runs on unseen."""
+def _prepare() -> None:
+    """Let this child be interrupted, and ask Linux to do so when its parent is killed: no simulation runs on unseen."""
+    # A shell starts a background job with SIGINT ignored, and who ignores it hands that on to its children.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     if os.uname().sysname == "Linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)

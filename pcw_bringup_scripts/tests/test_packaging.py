@@ -26,6 +26,7 @@ MAY_STAND_AT_THE_TOP = {*PACKAGES, "README.md", "LICENSE"}
 
 # The rosdep key that brings a module, where it is not the module's own name (as it is for ROS packages).
 KEY_OF_MODULE = {
+    "PIL": "python3-pil",
     "can": "python3-can",
     "jinja2": "python3-jinja2",
     "lz4": "mcap-ros2-support",
@@ -164,10 +165,11 @@ def test_installation_holds_every_file_of_the_sources(package):
     [installed] = {path.parent for path in prefix_of(package).rglob(f"*-packages/{package}/__init__.py")}
 
     def files(folder: Path) -> set[str]:
+        # Caches, of Python's or in a hidden folder, are no sources.
         return {
             path.relative_to(folder).as_posix()
             for path in folder.rglob("*")
-            if path.is_file() and "__pycache__" not in path.parts
+            if path.is_file() and not any(p == "__pycache__" or p.startswith(".") for p in path.relative_to(folder).parts)
         }
 
     assert files(source) - files(installed) == set()

@@ -55,8 +55,8 @@ class Robot:
     def _on_command(self, message):
         self.commands.append(message)
 
-    def publish_states(self):
-        self.time_ns += PERIOD_NS
+    def publish_states(self, at_ns=None):
+        self.time_ns = self.time_ns + PERIOD_NS if at_ns is None else at_ns
         if self.commands:
             force = self.torque[:, 0].sum() / 0.075
             self.twist = self.twist + np.array([force / 100.0 * 0.002, 0.0, 0.0])
@@ -98,13 +98,14 @@ def warnings_of(diagnostics):
 def test_follows_cmd_vel_and_stamps_each_answer_with_its_question(ros):
     controller = ros.start(CONTROLLER)
     robot = Robot(ros)
+    # Every measurement is answered, the first one at time zero too: a simulator in lock-step waits for it.
+    ros.wait_for(lambda: robot.commands, while_doing=lambda: robot.publish_states(at_ns=0))
+    assert stamp_to_ns(robot.commands[0].header.stamp) == 0
     robot.run(robot.drives)
     robot.run(lambda: abs(robot.twist[0] - 0.3) < 0.01)
     command = robot.commands[-1]
     assert command.name == NAMES and not command.velocity and not command.position
     assert 0 < stamp_to_ns(command.header.stamp) <= robot.time_ns
-    # Every measurement is answered, the first one at time zero too: a simulator in lock-step waits for it.
-    assert stamp_to_ns(robot.commands[0].header.stamp) == 0
     assert np.all(np.abs(robot.torque) <= THESIS.torque_limit)
     assert controller.interrupt() == 0
 

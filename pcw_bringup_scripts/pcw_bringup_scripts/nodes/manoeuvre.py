@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
 from rclpy.node import Node
@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from pcw_description.errors import PcwError
-from pcw_description.nodes.node_tools import COMMAND, SENSOR, declare, run_node, stamp_to_ns
+from pcw_description.nodes.node_tools import COMMAND_SOURCE, SENSOR, declare, run_node, stamp_to_ns
 
 from ..manoeuvres import MANOEUVRES
 
@@ -47,7 +47,9 @@ class ManoeuvreNode(Node):
         self._heard = self._told = time.monotonic()
         self._answer: Future | None = None
         self.finished = False
-        self._cmd_vel = self.create_publisher(TwistStamped, "cmd_vel", COMMAND)
+        self._command = TwistStamped()
+        self._command.header.frame_id = "base_link"
+        self._cmd_vel = self.create_publisher(TwistStamped, "cmd_vel", COMMAND_SOURCE)
         self._pause = self.create_client(SetBool, "bridge/pause")
         self.create_subscription(Clock, "/clock", self._on_clock, SENSOR)
         self.create_timer(0.05, self._look_round, clock=RclpyClock(clock_type=ClockType.STEADY_TIME))
@@ -86,8 +88,8 @@ class ManoeuvreNode(Node):
         if self._heard - self._told > PROGRESS_PERIOD:
             self._told = self._heard
             self.get_logger().info(f"progress {elapsed:.1f} of {self._manoeuvre.duration:.1f} s")
-        command = TwistStamped()
-        command.header.stamp, command.header.frame_id = message.clock, "base_link"
+        command = self._command
+        command.header.stamp = message.clock
         twist = self._manoeuvre.twist(elapsed)
         command.twist.linear.x, command.twist.linear.y, command.twist.angular.z = twist.tolist()
         self._cmd_vel.publish(command)
@@ -97,8 +99,9 @@ class ManoeuvreNode(Node):
 
     def close(self) -> None:
         """Leave the robot with a command to stand."""
-        if self._phase != "waiting":
-            self._cmd_vel.publish(TwistStamped())
+        if self._phase == "driving":
+            self._command.twist = Twist()
+            self._cmd_vel.publish(self._command)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -18,6 +18,7 @@ from pcw_description import PcwError, load_robot, odometry
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import (
     COMMAND,
+    COMMAND_SOURCE,
     SENSOR,
     StampWatch,
     declare,
@@ -101,7 +102,7 @@ class ComputedTorqueNode(LifecycleNode):
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Create the topics, and have everything compiled before the robot waits for an answer."""
         self._warm_up()
-        self._commands = self.create_publisher(JointState, "joint_commands", COMMAND)
+        self._commands = self.create_publisher(JointState, "joint_commands", COMMAND_SOURCE)
         self._inputs = [
             self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR),
             self.create_subscription(TwistStamped if self._stamped else Twist, "cmd_vel", self._on_cmd_vel, COMMAND),

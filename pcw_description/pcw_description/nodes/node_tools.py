@@ -346,8 +346,13 @@ def _profile(reliability: ReliabilityPolicy, durability: DurabilityPolicy, depth
 # both kinds of reader connect.
 SENSOR = _profile(ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE, 10)
 SENSOR_SOURCE = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 10)
+# Who integrates wants every sample, after a hiccup too: two seconds of them at 500 Hz; who feeds a recorder keeps as many.
+SENSOR_STREAM = _profile(ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE, 1000)
+SENSOR_STREAM_SOURCE = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 1000)
 # Only the newest command counts.
 COMMAND = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 1)
+# The newest is what a receiver takes; a recorder that was busy may still fetch those before.
+COMMAND_SOURCE = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 1000)
 # Late joiners get the last sample (maps, descriptions, static facts).
 LATCHED = _profile(ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL, 1)
 

@@ -11,8 +11,8 @@ from sensor_msgs.msg import JointState
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import (
-    SENSOR,
     SENSOR_SOURCE,
+    SENSOR_STREAM,
     Decimator,
     StampWatch,
     declare,
@@ -59,7 +59,7 @@ class EncoderSlipNode(Node):
         self._names = [f"{caster}_{direction}" for caster in self.robot.caster_names for direction in _DIRECTIONS]
         self._message = JointState(name=self._names)
         self._slip = self.create_publisher(JointState, "slip/encoder", SENSOR_SOURCE)
-        self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR)
+        self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR_STREAM)
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="slip")
 
     def _adopt_parameters(self) -> None:

@@ -15,8 +15,8 @@ from sensor_msgs.msg import JointState
 from pcw_description import PcwError, load_robot, odometry
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import (
-    SENSOR,
     SENSOR_SOURCE,
+    SENSOR_STREAM,
     Decimator,
     StampWatch,
     declare,
@@ -67,7 +67,7 @@ class OdometryNode(Node):
         self._warm_up()
         self._odom = self.create_publisher(Odometry, "odom", SENSOR_SOURCE)
         self._tf = self.create_publisher(TFMessage, "/tf", 100) if publish_tf and TFMessage is not None else None
-        self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR)
+        self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR_STREAM)
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="odometry")
 
     def _warm_up(self) -> None:

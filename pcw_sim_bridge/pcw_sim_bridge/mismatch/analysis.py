@@ -26,7 +26,6 @@ from .findings import (
     Trace,
     UnknownFinding,
 )
-from .open_set import Leftover
 from .regression_problem import FloatArray, RegressionProblem
 from .subject import Opened, Subject
 from .whitened_regression import Fit, WhitenedRegression, predicted
@@ -38,10 +37,6 @@ FLAG_PROBABILITY = 1e-3
 LEAST_DURATION = 5.0  # [s]
 # Part of a recording held out at its end where none was given for it.
 HELD_OUT_PART = 0.3
-# A leftover is reported where it is this part of what its channel measures. Below it lie details that no description of a
-# real machine holds (the lean on its springs, the ripple of a filter); a tool that reports them on every healthy robot
-# says nothing.
-SMALLEST_LEFTOVER = 0.02
 # A number of the description is reported where it moves by this many of its own standard errors and a tenth of its
 # tolerance, or where its standard error is below this part of its tolerance: then the recordings have measured it.
 RETUNED_SIGNIFICANCE = 2.0
@@ -96,11 +91,11 @@ def analyse(
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
     explanation = explain(problem, np.random.default_rng(seed), settings, progress)
     instances = [effect_instance(named) for named in explanation.named]
-    leftovers = [leftover for leftover in explanation.leftovers if _matters(explanation, leftover)]
+    leftovers = explanation.leftovers
     retuned = _retuned(problem, explanation.fit)
     patched = subject.patched(instances, {r.name: r.value for r in retuned})
     progress("proving it on held-out data")
-    fit_finding, held_out_problem, held_out_fit = _prove(subject, patched, explanation, opened, held_out)
+    fit_finding, held_out_problem, held_out_fit, ran_away = _prove(subject, patched, explanation, opened, held_out)
     verdict = {
         (True, False): "explained",
         (True, True): "partly_explained",
@@ -125,7 +120,7 @@ def analyse(
             *_traces(problem, explanation.fit, "fit"),
             *(_traces(held_out_problem, held_out_fit, "holdout") if held_out else ()),
         ),
-        notes=_notes(explanation, retuned, bool(held_out), bool(leftovers)),
+        notes=_notes(explanation, retuned, bool(held_out), bool(leftovers), ran_away),
         seconds=time.monotonic() - begun,
     )
     return Analysis(findings, patched)
@@ -156,18 +151,17 @@ def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance
         parameters=parameters,
         statement=subject.statement(instance),
         ambiguous_with=tuple(dict.fromkeys(named.ambiguous_with)),
-        experiment=effect.separating_experiment if named.ambiguous_with and effect.separating_experiment else None,
+        experiment=_experiment(named),
     )
 
 
-def _matters(explanation: Explanation, leftover: Leftover) -> bool:
-    """Whether a leftover is a noticeable part of what its channel measures."""
-    problem = explanation.search.problem
-    c = [channel.name for channel in problem.channels].index(leftover.channel)
-    valid = problem.valid[:, c]
-    residual = explanation.selection.regression.unwhitened_residual(explanation.fit)[valid, c]
-    size = float(np.sqrt(leftover.share * np.mean(residual**2)))
-    return size > SMALLEST_LEFTOVER * float(np.std(problem.measured[valid, c]))
+def _experiment(named: NamedTerm) -> str | None:
+    """What would tell an effect from those it is ambiguous with: what each of them asks for."""
+    if not named.ambiguous_with:
+        return None
+    effects = (named.term.effect, *(name.partition("/")[0] for name in named.ambiguous_with))
+    asked = dict.fromkeys(get(name).separating_experiment for name in effects)
+    return "; ".join(text for text in asked if text) or None
 
 
 def _rms(values: FloatArray, valid: np.ndarray) -> FloatArray:
@@ -248,8 +242,11 @@ def _prove(
     explanation: Explanation,
     opened: Sequence[Opened],
     held_out: Sequence[Opened],
-) -> tuple[FitFinding, RegressionProblem, Fit]:
-    """Errors on data that the fit has not seen: given recordings, or the last part of the fitted ones after a refit."""
+) -> tuple[FitFinding, RegressionProblem, Fit, tuple[str, ...]]:
+    """Errors on data that the fit has not seen: given recordings, or the last part of the fitted ones after a refit.
+
+    The last value names signals whose simulation ran away, with the description or with its patch.
+    """
     problem, selection = explanation.search.problem, explanation.selection
     regression = selection.regression
     if held_out:
@@ -276,8 +273,10 @@ def _prove(
     closed = (before - after) / (before - floor) if before > floor else 1.0 if after <= before else 0.0
     data = held_out or opened
     nominal_rollout, patched_rollout = subject.rollout(data), patched.rollout(data)
-    rollout = {name: (nominal_rollout[name], patched_rollout[name]) for name in nominal_rollout}
-    return FitFinding(source, (before, after), rollout, float(min(max(closed, 0.0), 1.0))), proof, fit
+    both = {name: (nominal_rollout[name], patched_rollout[name]) for name in nominal_rollout}
+    rollout = {name: pair for name, pair in both.items() if np.isfinite(pair).all()}
+    finding = FitFinding(source, (before, after), rollout, float(min(max(closed, 0.0), 1.0)))
+    return finding, proof, fit, tuple(sorted(set(both) - set(rollout)))
 
 
 def _mean(values: FloatArray, rows: np.ndarray) -> FloatArray:
@@ -320,7 +319,11 @@ def _traces(problem: RegressionProblem, fit: Fit, role: str) -> tuple[Trace, ...
 
 
 def _notes(
-    explanation: Explanation, retuned: Sequence[RetunedFinding], has_holdout: bool, unfinished: bool
+    explanation: Explanation,
+    retuned: Sequence[RetunedFinding],
+    has_holdout: bool,
+    unfinished: bool,
+    ran_away: Sequence[str],
 ) -> tuple[str, ...]:
     """What a reader has to know to judge the findings."""
     notes = []
@@ -343,6 +346,8 @@ def _notes(
         notes.append("What is left is not noise; the names above explain their part of it and no more.")
     if unfinished and explanation.refinement is not None:
         notes.append(f"First suspect for what is left: {explanation.refinement.describe()}.")
+    if ran_away:
+        notes.append(f"Driven by the measured torques the simulation ran away in {', '.join(ran_away)}.")
     share = float(problem.valid.mean())
     if share < 0.9:
         notes.append(f"{100 * (1 - share):.0f} % of the samples could not be judged (standstill, gross slip or missing data).")

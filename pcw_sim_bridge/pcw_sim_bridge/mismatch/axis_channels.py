@@ -35,6 +35,8 @@ LARGEST_CUTOFF = (
     40.0  # [Hz]; above it real drives show the resonances of their structure, which no effect here describes
 )
 SMALLEST_CUTOFF = 2.0
+# A force that is held between samples loses (w T)^2 / 24 of its amplitude: 1.6 % at this many samples per period.
+SAMPLES_PER_CUTOFF = 10.0
 # Derivatives are formed of signals filtered this much wider than the channel, so that kernels see sharp reversals.
 PREFILTER_RATIO = 2.5
 # The noise that differentiation puts into the inertial force may reach this part of the measured force.
@@ -67,7 +69,7 @@ def choose_cutoff(axis: AxisDescription, recordings: Sequence[AxisRecording]) ->
     cutoffs = []
     for recording in recordings:
         rate = 1.0 / float(np.median(np.diff(recording.time)))
-        limit = min(LARGEST_CUTOFF, rate / 6.0)
+        limit = min(LARGEST_CUTOFF, rate / SAMPLES_PER_CUTOFF)
         noise = white_noise_level(recording.position) if recording.velocity is None else 0.0
         allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(recording.force)), 1e-300) / axis.inertia
         if noise > 0.0:
@@ -158,7 +160,8 @@ class AxisProblemBuilder:
         }
         self._acceleration = self._variables["acceleration"]
         self._valid = self._filtered([m.still for m in self.motions]) < 0.1
-        self._smooth_forces = self._explained_force()
+        self._smooth_forces = self._explained_force(with_load=True)
+        self._plain_forces = self._explained_force(with_load=False)
 
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         """Channel filter on full-rate arrays of all motions, joined: [(T_i, ...)] -> (T, ...)."""
@@ -166,8 +169,11 @@ class AxisProblemBuilder:
             [self.filters[m.recording].apply(p) for m, p in zip(self.motions, pieces, strict=True)]
         )
 
-    def _explained_force(self) -> list[FloatArray]:
+    def _explained_force(self, with_load: bool) -> list[FloatArray]:
         """The force as the simplest models of a drive would have it, at full rate.
+
+        Args:
+            with_load: include a friction that follows the load, which only effects non-linear in the force need.
 
         Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
         and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
@@ -179,8 +185,8 @@ class AxisProblemBuilder:
         def basis(m: AxisMotion) -> FloatArray:
             sign = np.tanh(m.velocity / (0.02 * top))
             a, v = m.acceleration, m.velocity
-            jerk = derivative(a, self.filters[m.recording].rate)  # what a skew of the clocks adds
-            return np.stack([a, v, sign, np.ones_like(sign), np.abs(a) * sign, jerk], axis=1)
+            columns = [a, v, sign, np.ones_like(sign)]
+            return np.stack([*columns, np.abs(a) * sign] if with_load else columns, axis=1)
 
         stacked = np.concatenate([basis(m) for m in self.motions])
         force = np.concatenate([m.force for m in self.motions])
@@ -289,14 +295,17 @@ class AxisProblemBuilder:
     ) -> list[FloatArray]:
         zero = [np.zeros_like(m.position) for m in self.motions]
         return [
-            effect.contribution(m.position, m.velocity, f, z, parameters)
-            for m, f, z in zip(self.motions, self._smooth_forces, zero, strict=True)
+            effect.contribution(m.position, m.velocity, m.force, z, parameters)
+            for m, z in zip(self.motions, zero, strict=True)
         ]
 
     def _columns(self, effect: JointTorqueEffect, shape: Shape) -> FloatArray:
         """Exact columns (T, 1, P): what one unit of each linear parameter adds to the force the motor must give."""
         per_motion = []
-        for m, force in zip(self.motions, self._smooth_forces, strict=True):
+        gain_only = kernel_arguments(effect.name) == ("force",)
+        for m, force in zip(
+            self.motions, self._plain_forces if gain_only else self._smooth_forces, strict=True
+        ):
             by_name = effect.regressor(m.position, m.velocity, force, np.zeros_like(force), shape)
             per_motion.append(-np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1))
         return self._filtered(per_motion)[:, None, :]

@@ -18,7 +18,7 @@ import numpy as np
 
 from .noise_model import SLOW_ORDINATES, fit_noise_model, huber_weights, robust_deviation, white_noise_model
 from .regression_problem import FloatArray, IntArray, RegressionProblem, contiguous_blocks, segment_slices
-from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression
+from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression, predicted
 
 Progress = Callable[[str], None]
 
@@ -339,12 +339,14 @@ class EffectSearch:
         largest = np.array(
             [max(c.gain for c in found) if found else 0.0 for found in regression.scan((), targets)]
         )
-        largest = np.maximum(largest[np.isfinite(largest)], 0.0)
+        largest = largest[np.isfinite(largest)]  # mostly below zero: evidence makes every parameter pay for itself
         if len(largest) < 10:
             return self.settings.smallest_threshold
         spread = float(np.std(largest)) * math.sqrt(6.0) / math.pi
         place = float(np.mean(largest)) - 0.5772 * spread
         tail = place - spread * math.log(-math.log(1.0 - self.settings.false_alarm_rate))
+        # The surrogates take the noise model for the truth; nothing is made surer than that would be.
+        self.noise_gain = (max(place, 0.0), max(spread, 1.0))
         self.progress(
             f"surrogates: largest gain of noise {np.median(largest):.1f} (median), threshold {tail:.1f} nats"
         )
@@ -409,7 +411,11 @@ class EffectSearch:
         valid = self.problem.valid
         remains = np.array([robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])])
         full_scores = regression.block_scores(instances)
-        losses, held_out, contributions = [], [], []
+        losses, held_out = [], []
+        own: list[FloatArray] = []
+        net: list[FloatArray] = []
+        retunings: list[float] = []
+        explained = predicted(self.problem, fit)
         position = len(self.problem.nuisances)
         for index, instance in enumerate(instances):
             others = instances[:index] + instances[index + 1 :]
@@ -418,20 +424,28 @@ class EffectSearch:
             # Held-out error alone would not mind a mass far outside its tolerance; the description would.
             retuning = regression.tolerance_cost(without) - regression.tolerance_cost(fit)
             held_out.append(0.5 * float(np.sum(regression.block_scores(others) - full_scores)) + retuning)
-            columns = self.problem.terms[instance.term].columns(dict(instance.shape))[
-                ..., list(instance.active)
-            ]
+            columns = self.problem.columns(instance.term, instance.shape)[..., list(instance.active)]
             part = columns @ fit.mean[position : position + len(instance.active)]
             position += len(instance.active)
-            sizes = [
-                float(np.sqrt(np.mean(part[valid[:, c], c] ** 2))) if valid[:, c].any() else 0.0
-                for c in range(len(remains))
-            ]
-            contributions.append(sizes)
-        total = np.sqrt(np.sum(np.square(contributions), axis=0))
+            own.append(self._sizes(part))
+            # What a term does for the prediction is what the others cannot do in its place.
+            net.append(self._sizes(explained - predicted(self.problem, without)))
+            retunings.append(retuning)
+        total = np.sqrt(np.sum(np.square(own), axis=0))
         floor = np.maximum(self.settings.smallest_share * remains, self.settings.smallest_part * total)
-        shares = [float(np.max(np.asarray(sizes) / np.maximum(floor, 1e-300))) for sizes in contributions]
+        shares = []
+        for sizes, retuning in zip(net, retunings, strict=True):
+            share = float(np.max(sizes / np.maximum(floor, 1e-300)))
+            # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
+            shares.append(max(share, retuning / self.settings.smallest_threshold))
         return losses, held_out, shares
+
+    def _sizes(self, values: FloatArray) -> FloatArray:
+        """Root mean square of (T, C) over valid samples, per channel."""
+        valid = self.problem.valid
+        counts = np.maximum(valid.sum(axis=0), 1)
+        sizes: FloatArray = np.sqrt(np.sum(np.where(valid, values, 0.0) ** 2, axis=0) / counts)
+        return sizes
 
     def label(self, instance: Instance) -> str:
         """Effect, target and shape in one short text."""

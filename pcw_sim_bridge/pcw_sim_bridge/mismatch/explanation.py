@@ -3,9 +3,11 @@
     explanation = explain(problem, rng)
 
 runs the search, the open-set test and, where something is left that depends on an argument of a named effect, tries the
-refinements of that effect (a friction that differs forwards and backwards). A refined law replaces the plain ones only
-if it completes the explanation. Otherwise the plain law stays, and the refinement is reported with the leftover: it is
-the first suspect for physics that the library does not hold in full.
+refinements of that effect (a friction that differs forwards and backwards). A refined law is adopted if it completes the
+explanation and every plain effect stays beside it. Otherwise the plain law stays, and the refinement is reported with the
+leftover: it is the first suspect for physics that the library does not hold in full. A plain effect that the refinement
+would put out (an offset, by a friction that differs between directions) is said to be ambiguous with it: what decides
+between them is the shape of what is left, and that may have a third cause.
 """
 
 from __future__ import annotations
@@ -63,7 +65,7 @@ class NamedTerm:
 
 @dataclasses.dataclass(frozen=True)
 class Refinement:
-    """A refined law that fits better without completing the explanation.
+    """A refined law that fits better without being adopted.
 
     Attributes:
         named: its effects with all their parameters.
@@ -98,7 +100,7 @@ class Explanation:
     Attributes:
         leftovers: dependences that nothing named explains, strongest first.
         withdrawn: names that a leftover explains better: (label, variable).
-        refinement: a refined law that is not enough; None if there is none, or if it was adopted.
+        refinement: a refined law that was not adopted; None if there is none, or if it was adopted.
         floor: rms of each channel that nothing measured explains (C,).
         p_values: of each channel holding noise and tolerances only (C,).
     """
@@ -146,28 +148,39 @@ def explain(
         refined = _refined(search, selection, result)
         if refined is not None:
             instances, gain, share = refined
+            terms = {i.term for i in instances}
+            dropped = {problem.terms[i.term].effect for i in selection.fit.instances if i.term not in terms}
             finished = OpenSetTest(search, instances).run(selection.threshold)
-            if not finished.leftovers:
+            if not finished.leftovers and not dropped:
                 progress("a refined law completes the explanation")
                 selection, result = search.conclude(instances, selection.threshold), finished
             else:
                 better = search.conclude(instances, selection.threshold)
-                terms = {i.term for i in instances}
-                dropped = {
-                    problem.terms[i.term].effect for i in selection.fit.instances if i.term not in terms
-                }
                 refinement = Refinement(named_terms(search, better), tuple(sorted(dropped)), gain, share)
-                progress(f"not completed by {refinement.describe()}")
+                progress(f"not adopted: {refinement.describe()}")
+    named = named_terms(search, selection)
+    if refinement is not None:
+        named = tuple(_doubted(entry, refinement) for entry in named)
     return Explanation(
         search=search,
         selection=selection,
-        named=named_terms(search, selection),
+        named=named,
         leftovers=result.leftovers,
         withdrawn=tuple(withdrawn),
         refinement=refinement,
         floor=result.floor,
         p_values=_p_values(search, selection, result),
     )
+
+
+def _doubted(entry: NamedTerm, refinement: Refinement) -> NamedTerm:
+    """The entry, said to be ambiguous with the refined effects if these would do without it."""
+    if entry.term.effect not in refinement.dropped:
+        return entry
+    rivals = (other.term.effect for other in refinement.named if any(
+        p.refinement and p.name in other.estimates for p in other.term.parameters
+    ))
+    return dataclasses.replace(entry, ambiguous_with=tuple(dict.fromkeys((*entry.ambiguous_with, *rivals))))
 
 
 def _refined(
@@ -231,7 +244,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
         for name, value in instance.shape:
             low, high = _profile(regression, others, instance, name, fit.log_evidence)
             estimates[name] = Estimate(value, "", low, high)
-        columns = term.columns(dict(instance.shape))[..., list(instance.active)]
+        columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         contribution = columns @ fit.mean[position : position + len(instance.active)]
         position += len(instance.active)
         probability, alike = _alternatives(search, selection, index)

@@ -24,6 +24,9 @@ HARMONICS = 3
 # A function of one variable must take this part of what is left of a channel to be worth a report.
 SMALLEST_SHARE = 0.10
 SMALLEST_GAIN = 10.0  # nats, on top of the threshold of the names
+# It must also reach this part of the measured signal. Below lie details that no description of a real machine holds (the
+# lean on its springs, the ripple of a filter); a tool that reports them on every healthy robot says nothing.
+SMALLEST_PART = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,11 +136,18 @@ class OpenSetTest:
 
     def _leading(self, channel: int, instances: Sequence[Instance], threshold: float) -> Leftover | None:
         best: Leftover | None = None
+        valid = self.problem.valid[:, channel]
+        if not valid.any():
+            return None
+        signal = float(np.std(self.problem.measured[valid, channel]))
         for (c, name), (functions, knots) in self.bases.items():
             if c != channel:
                 continue
             gain, share, curve = self._dependence(channel, name, functions, knots, instances)
-            passes = gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE
+            size = np.sqrt(share) * float(np.sqrt(np.mean(self.residual[valid, channel] ** 2)))
+            passes = (
+                gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE and size > SMALLEST_PART * signal
+            )
             if passes and (best is None or gain > best.gain):
                 best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
         return best
@@ -216,8 +226,7 @@ class AugmentedFit:
 
     def _posterior(self, gram: FloatArray, count: int) -> FloatArray:
         precision = gram[:count, :count] + np.diag(1.0 / self.deviations[:count] ** 2)
-        solution: FloatArray = np.linalg.solve(precision, gram[:count, -1])
-        return solution
+        return np.asarray(np.linalg.solve(precision, gram[:count, -1]), dtype=np.float64)
 
     def held_out_errors(self) -> tuple[float, float]:
         """Squared whitened error on held-out blocks without and with the function."""
@@ -239,9 +248,7 @@ class AugmentedFit:
         total = grams.sum(axis=0)
         parts = [problem.nuisance_columns()]
         for instance in self.instances:
-            parts.append(
-                problem.terms[instance.term].columns(dict(instance.shape))[..., list(instance.active)]
-            )
+            parts.append(problem.columns(instance.term, instance.shape)[..., list(instance.active)])
         plain = np.concatenate([*parts, self.columns], axis=2)[:, channel]
         residual = problem.residual[:, channel].copy()
         used = self.regression.block_labels()

@@ -130,6 +130,9 @@ class RegressionProblem:
     nuisances: tuple[Nuisance, ...]
     terms: tuple[Term, ...]
     variables: Mapping[str, FloatArray]
+    _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         """Check shapes once, so that the engine need not.
@@ -148,6 +151,12 @@ class RegressionProblem:
                 )
         if not np.isfinite(self.residual[self.valid]).all():
             raise ValueError("residual holds NaN at samples said to be valid")
+
+    def columns(self, term: int, shape: tuple[tuple[str, float], ...]) -> FloatArray:
+        """Columns (T, C, P) of one term at one shape, computed once."""
+        if (term, shape) not in self._remembered:
+            self._remembered[term, shape] = self.terms[term].columns(dict(shape))
+        return self._remembered[term, shape]
 
     def nuisance_columns(self) -> FloatArray:
         """Nuisance columns side by side, (T, C, K)."""

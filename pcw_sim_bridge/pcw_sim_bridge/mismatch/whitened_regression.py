@@ -124,8 +124,7 @@ class WhitenedRegression:
         """Whitened exact columns of an instance's active parameters (R, active)."""
         key = (instance.term, instance.shape)
         if key not in self._columns:
-            term = self.problem.terms[instance.term]
-            self._columns[key] = self._rows(term.columns(dict(instance.shape)))
+            self._columns[key] = self._rows(self.problem.columns(*key))
         return self._columns[key][:, list(instance.active)]
 
     def deviations(self, instances: Sequence[Instance]) -> FloatArray:
@@ -202,7 +201,8 @@ class WhitenedRegression:
             if term.scan is not None:
                 full = term.scan()
             else:
-                full = np.stack([term.columns(shape) for shape in term.shapes], axis=2)
+                shapes_tried = [tuple(sorted(shape.items())) for shape in term.shapes]
+                full = np.stack([self.problem.columns(term_index, shape) for shape in shapes_tried], axis=2)
             base = full[..., list(term.base_indices())]
             samples, channels, shapes, width = base.shape
             white = self._rows(base.reshape(samples, channels, shapes * width))
@@ -295,7 +295,7 @@ def predicted(problem: RegressionProblem, fit: Fit) -> FloatArray:
     total: FloatArray = problem.nuisance_columns() @ fit.mean[:count]
     position = count
     for instance in fit.instances:
-        columns = problem.terms[instance.term].columns(dict(instance.shape))[..., list(instance.active)]
+        columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         total = total + columns @ fit.mean[position : position + len(instance.active)]
         position += len(instance.active)
     return total

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState
 
-from pcw_description.nodes.node_tools import SENSOR_SOURCE, fill_joint_state, ns_to_stamp
+from pcw_description.nodes.node_tools import SENSOR_STREAM_SOURCE, fill_joint_state, ns_to_stamp
 from pcw_description.robot_description import LATERAL, LONGITUDINAL, RobotDescription
 
 from ..plants.plant import PlantState
@@ -25,12 +25,12 @@ class BridgePublishers:
     def __init__(self, node: Node, robot: RobotDescription, clock_rate: float) -> None:
         self._clock_period_ns, self._next_clock_ns = round(NANOSECONDS / clock_rate), 0
         self._clock = node.create_publisher(Clock, "/clock", 1)
-        self.joint_states = node.create_publisher(JointState, "joint_states", SENSOR_SOURCE)
-        self._truth = node.create_publisher(Odometry, "ground_truth/odom", SENSOR_SOURCE)
+        self.joint_states = node.create_publisher(JointState, "joint_states", SENSOR_STREAM_SOURCE)
+        self._truth = node.create_publisher(Odometry, "ground_truth/odom", SENSOR_STREAM_SOURCE)
         # A robot without an IMU has no such topic, rather than a silent one.
-        self._imu = node.create_publisher(Imu, "imu/data", SENSOR_SOURCE) if robot.sensors.imu else None
+        self._imu = node.create_publisher(Imu, "imu/data", SENSOR_STREAM_SOURCE) if robot.sensors.imu else None
         self._contacts = [
-            node.create_publisher(WrenchStamped, f"contact/{name}/wrench", SENSOR_SOURCE) for name in robot.caster_names
+            node.create_publisher(WrenchStamped, f"contact/{name}/wrench", SENSOR_STREAM_SOURCE) for name in robot.caster_names
         ]
         self._joint_message = JointState(name=list(robot.joint_names))
         self._imu_message = _imu_message(robot)
