@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -29,7 +30,7 @@ from .regression_problem import (
     Shape,
     Term,
 )
-from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
+from .signal_filter import SignalFilter, derivative, refined, uniform_segments, white_noise_level
 
 LARGEST_CUTOFF = (
     40.0  # [Hz]; above it real drives show the resonances of their structure, which no effect here describes
@@ -37,19 +38,23 @@ LARGEST_CUTOFF = (
 SMALLEST_CUTOFF = 2.0
 # A force that is held between samples loses (w T)^2 / 24 of its amplitude: 1.6 % at this many samples per period.
 SAMPLES_PER_CUTOFF = 10.0
+# Signals are refined to this many samples per period of the cut-off before the sign of a speed is taken of them.
+FINE_SAMPLES_PER_CUTOFF = 40.0
 # Derivatives are formed of signals filtered this much wider than the channel, so that kernels see sharp reversals.
 PREFILTER_RATIO = 2.5
 # The noise that differentiation puts into the inertial force may reach this part of the measured force.
 ALLOWED_DERIVATIVE_NOISE = 0.05
 SHORTEST_SEGMENT = 1.0  # [s]
 LARGEST_ORDER_GRID = 1500
+# Coggings that take part in choosing the smoothing: so many, each explaining this part of what the others leave.
+LEADING_PERIODIC, SMALLEST_PERIODIC = 3, 0.1
 # Parameters that only smooth a sign: one value serves all effects of an axis, chosen once.
 SMOOTHING = "smoothing_speed"
 
 
 @dataclasses.dataclass(frozen=True)
 class AxisMotion:
-    """One contiguous piece at the recording's own rate, after the wide filter; arrays (T,)."""
+    """One contiguous piece after the wide filter, refined; arrays (T,)."""
 
     recording: int
     time: FloatArray
@@ -81,10 +86,10 @@ def choose_cutoff(axis: AxisDescription, recordings: Sequence[AxisRecording]) ->
 def axis_motion(
     axis: AxisDescription, recording: AxisRecording, index: int, cutoff: float
 ) -> tuple[float, list[AxisMotion]]:
-    """Filter one recording and differentiate it.
+    """Filter one recording, refine and differentiate it.
 
     Returns:
-        The sampling rate [Hz] and the usable pieces.
+        The rate of the refined pieces [Hz] and the usable pieces.
     """
     velocity = recording.velocity if recording.velocity is not None else np.full_like(recording.time, np.nan)
     signals = np.stack([recording.position, velocity, recording.force + recording.external_force], axis=1)
@@ -93,28 +98,28 @@ def axis_motion(
     noise = white_noise_level(recording.position)
     # Deviation of the velocity of a noisy position after the wide filter.
     creep = noise * np.sqrt(2.0 / rate * (2.0 * np.pi) ** 2 * min(wide.cutoff, 0.5 * rate) ** 3 / 3.0)
+    factor = max(1, math.ceil(FINE_SAMPLES_PER_CUTOFF * cutoff / rate))
     motions = []
     for stamps, values in pieces:
         if stamps[-1] - stamps[0] < SHORTEST_SEGMENT:
             continue
         position, force = wide.smooth(values[:, 0]), wide.smooth(values[:, 2])
-        if recording.velocity is None:
-            speed = derivative(position, rate)
-        else:
-            speed = wide.smooth(values[:, 1])
+        speed = derivative(position, rate) if recording.velocity is None else wide.smooth(values[:, 1])
+        fine = refined(np.stack([position, speed, derivative(speed, rate), force], axis=1), factor)
+        position, speed, acceleration, force = fine.T
         floor = max(4.0 * creep, 2e-3 * float(np.max(np.abs(speed))))
         motions.append(
             AxisMotion(
                 recording=index,
-                time=stamps,
+                time=stamps[0] + np.arange(len(fine)) / (factor * rate),
                 position=position,
                 velocity=speed,
-                acceleration=derivative(speed, rate),
+                acceleration=acceleration,
                 force=force,
-                still=_long_runs(np.abs(speed) < floor, int(0.05 * rate)),
+                still=_long_runs(np.abs(speed) < floor, int(0.05 * factor * rate)),
             )
         )
-    return rate, motions
+    return factor * rate, motions
 
 
 def _long_runs(flags: BoolArray, shortest: int) -> FloatArray:
@@ -141,7 +146,7 @@ class AxisProblemBuilder:
         Raises:
             MismatchError: no recording has a piece long enough.
         """
-        self.axis = axis
+        self.axis, self.recordings = axis, tuple(recordings)
         self.cutoff = cutoff if cutoff is not None else choose_cutoff(axis, recordings)
         rates_and_motions = [
             axis_motion(axis, recording, i, self.cutoff) for i, recording in enumerate(recordings)
@@ -195,39 +200,81 @@ class AxisProblemBuilder:
         scaled = solution / size
         return [basis(m) @ scaled for m in self.motions]
 
-    def choose_smoothing(self, others: Sequence[tuple[str, Shape]] = ()) -> float:
-        """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares.
-
-        Args:
-            others: further effects with their shapes that the fit shall hold beside the frictions of the vocabulary,
-                so that a cogging, say, does not choose the smoothing.
-        """
+    def choose_smoothing(self) -> float:
+        """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares."""
         frictions = [
             e for e in candidate_effects() if e.parameters and SMOOTHING in {p.name for p in e.parameters}
         ]
-        companions = [("drive_viscous_friction", {}), ("constant_load", {}), *others]
-        fixed = [self._acceleration[:, None]]
-        fixed += [self._columns(all_effects()[name], shape)[:, 0, :] for name, shape in companions]  # type: ignore[arg-type]
-        valid = self._valid
+        shaped = [[p.name for p in effect.nonlinear_parameters if p.name != SMOOTHING] for effect in frictions]
         top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.98)), 1e-12)
 
-        def misfit(smoothing: float) -> float:
-            columns = list(fixed)
-            for effect in frictions:
-                shapes = [p for p in effect.nonlinear_parameters if p.name != SMOOTHING]
-                shape = {SMOOTHING: smoothing} | {p.name: 0.1 * top for p in shapes}
-                columns.append(self._columns(effect, shape)[:, 0, :])
-            stacked = np.concatenate(columns, axis=1)[valid]
-            size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
-            solution, *_ = np.linalg.lstsq(stacked / size, self._force[valid], rcond=1e-8)
-            return float(np.sum((self._force[valid] - stacked / size @ solution) ** 2))
+        def friction_columns(smoothing: float, width: float) -> list[FloatArray]:
+            return [
+                self._columns(effect, {SMOOTHING: smoothing} | dict.fromkeys(names, width * top))[:, 0, :]
+                for effect, names in zip(frictions, shaped, strict=True)
+            ]
 
-        grid = top * np.geomspace(5e-4, 0.2, 9)
+        companions = ("drive_viscous_friction", "constant_load")
+        fixed = [self._acceleration[:, None], self._skew()[:, None]]
+        fixed += [self._columns(all_effects()[name], {})[:, 0, :] for name in companions]  # type: ignore[arg-type]
+        fixed += self._leading_periodic([*fixed, *friction_columns(0.005 * top, 0.12)])
+
+        def misfit(smoothing: float) -> float:
+            # Further shapes are tried, too: a curve of the wrong width would be mended by the smoothing.
+            return min(
+                self._misfit([*fixed, *friction_columns(smoothing, width)]) for width in (0.03, 0.06, 0.12, 0.25, 0.5)
+            )
+
+        # A reversal that takes more than a twentieth of the top speed is no dry friction.
+        grid = top * np.geomspace(5e-4, 0.05, 7)
         best = grid[int(np.argmin([misfit(float(value)) for value in grid]))]
         for width in (0.5, 0.2):
             nearby = best * np.exp(width * np.array([-1.0, 0.0, 1.0]))
             best = nearby[int(np.argmin([misfit(float(value)) for value in nearby]))]
         return float(best)
+
+    def _misfit(self, columns: Sequence[FloatArray]) -> float:
+        """Least squares of the force that remain beside columns (T, P)."""
+        stacked = np.concatenate(columns, axis=1)[self._valid]
+        scaled = stacked / np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
+        force = self._force[self._valid]
+        right = scaled.T @ force
+        return float(force @ force - right @ np.linalg.lstsq(scaled.T @ scaled, right, rcond=1e-12)[0])
+
+    def _leading_periodic(self, columns: Sequence[FloatArray]) -> list[FloatArray]:
+        """Columns of the strongest effects periodic in position, beside given columns: up to three that matter.
+
+        Without them a cogging would choose the smoothing.
+        """
+        valid = self._valid
+        found: list[FloatArray] = []
+        for effect in candidate_effects():
+            term = self._term(effect, 1.0)
+            if term.scan is None:
+                continue
+            scanned = term.scan()[valid, 0]
+            for _ in range(LEADING_PERIODIC):
+                known, _ = np.linalg.qr(np.concatenate([*columns, *found], axis=1)[valid])
+                left = self._force[valid] - known @ (known.T @ self._force[valid])
+                flat = scanned.reshape(len(scanned), -1)
+                free = (flat - known @ (known.T @ flat)).reshape(scanned.shape)
+                grams = np.einsum("tsp,tsq->spq", free, free)
+                right = np.einsum("tsp,t->sp", free, left)
+                grams += 1e-6 * np.trace(grams, axis1=1, axis2=2)[:, None, None] * np.eye(grams.shape[2]) + 1e-300
+                gains = np.einsum("sp,sp->s", right, np.linalg.solve(grams, right[..., None])[..., 0])
+                best = int(np.argmax(gains))
+                if gains[best] < SMALLEST_PERIODIC * float(left @ left):
+                    break
+                found.append(term.columns(term.shapes[best])[:, 0, :])
+        return found
+
+    def _skew(self) -> FloatArray:
+        """What a force measured later than it acts adds per second of delay (T,): F(t - d) = F(t) - d F'(t).
+
+        Of the explained force, not the measured one, for the reason given there.
+        """
+        rates = [self.filters[m.recording].rate for m in self.motions]
+        return self._filtered([-derivative(f, rate) for f, rate in zip(self._smooth_forces, rates, strict=True)])
 
     def build(self, smoothing: float) -> RegressionProblem:
         """Return the problem with the given smoothing of all signs."""
@@ -249,14 +296,8 @@ class AxisProblemBuilder:
             predicted = predicted + arm.moment * shape
             deviation = _deviation(axis, "gravity_moment", arm.moment)
             nuisances.append(Nuisance("gravity_moment", "N m", arm.moment, deviation, shape[:, None]))
-        # Force measured later than it acts: F(t - d) = F(t) - d F'(t), with the derivative of the explained force.
-        skew = self._filtered(
-            [
-                -derivative(f, self.filters[m.recording].rate)
-                for m, f in zip(self.motions, self._smooth_forces, strict=True)
-            ]
-        )
-        period = 1.0 / max(f.rate for f in self.filters)
+        skew = self._skew()
+        period = min(float(np.median(np.diff(recording.time))) for recording in self.recordings)
         nuisances.append(
             Nuisance("clock_offset", "s", 0.0, _deviation(axis, "clock_offset", 1.0) * period, skew[:, None])
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy import signal
+from scipy import interpolate, signal
 
 from .regression_problem import FloatArray
 
@@ -86,6 +86,19 @@ def derivative(values: FloatArray, rate: float) -> FloatArray:
     )
     result[half:-half] = np.asarray(inner) * rate
     return result
+
+
+def refined(values: FloatArray, factor: int) -> FloatArray:
+    """Interpolate a smooth signal by quintic splines, (T, ...) -> (factor (T - 1) + 1, ...), along its first axis.
+
+    What depends on a signal sharply, as a friction does on the sign of a speed, has a spectrum far beyond the signal's
+    own; evaluated on coarse samples it would fold back into the channel.
+    """
+    if factor == 1:
+        return values
+    samples = np.arange(len(values))
+    finer: FloatArray = interpolate.make_interp_spline(samples, values, k=5)(np.arange(factor * samples[-1] + 1) / factor)
+    return finer
 
 
 def white_noise_level(values: FloatArray) -> float:
