@@ -238,7 +238,8 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
         estimates = {}
         for offset, parameter_index in enumerate(instance.active):
             parameter = term.parameters[parameter_index]
-            value, half = float(fit.mean[position + offset]), HALF_WIDTH * float(deviation[position + offset])
+            value = float(fit.mean[position + offset])
+            half = HALF_WIDTH * math.hypot(float(deviation[position + offset]), problem.scale_deviation * value)
             estimates[parameter.name] = Estimate(value, parameter.unit, value - half, value + half)
         others = fit.instances[:index] + fit.instances[index + 1 :]
         for name, value in instance.shape:

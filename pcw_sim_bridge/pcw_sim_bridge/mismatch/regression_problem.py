@@ -117,6 +117,8 @@ class RegressionProblem:
         measured: the measured side of each channel (T, C), for error ratios; residual = measured - predicted.
         valid: samples that may be judged (T, C).
         variables: what a leftover may depend on: name -> (T,).
+        scale_deviation: relative deviation of the measured side's scale that no nuisance holds; what an effect measures
+            against it is known no better.
     """
 
     channels: tuple[Channel, ...]
@@ -130,6 +132,7 @@ class RegressionProblem:
     nuisances: tuple[Nuisance, ...]
     terms: tuple[Term, ...]
     variables: Mapping[str, FloatArray]
+    scale_deviation: float = 0.0
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )

@@ -121,7 +121,13 @@ class RobotProblemBuilder:
             nuisances=tuple(self._nuisances(sides)),
             terms=tuple(self._terms(sides, measured)),
             variables=self._variables(),
+            scale_deviation=self._scale_deviation(),
         )
+
+    def _scale_deviation(self) -> float:
+        """Relative deviation of what all torque constants share."""
+        known = self.robot.tolerance("torque_constant")
+        return known.value / float(np.sqrt(2 * self.robot.n)) if self.balanced else 0.0
 
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         return np.concatenate([f.apply(piece) for f, piece in zip(self.filters, pieces, strict=True)])
@@ -199,7 +205,7 @@ class RobotProblemBuilder:
                 numbers.torque_lag += step
 
             # A drive reports the torque of some instant within its own cycle; nobody knows which.
-            found.append(("torque_lag", "s", 0.0, 0.5 * max(m.sampling for m in self.motions), lag))
+            found.append(("torque_lag", "s", 0.0, max(m.sampling for m in self.motions), lag))
             number("chassis.mass", "chassis.mass", robot.chassis.mass, entry("chassis", 0))
             number("chassis.com", "chassis.com.x", 0.0, entry("chassis", 1))
             number("chassis.com", "chassis.com.y", 0.0, entry("chassis", 2))
@@ -227,12 +233,7 @@ class RobotProblemBuilder:
             if self.balanced:
                 number("caster_offset", f"caster_offset.x/{caster.name}", 0.0, entry("caster_offset", (i, 0)))
                 for axis, axis_name in enumerate(AXIS_NAMES):
-                    number(
-                        "torque_constant",
-                        f"torque_constant/{caster.name}_{axis_name}",
-                        1.0,
-                        entry("gain", (i, axis)),
-                    )
+                    number("torque_constant", f"torque_constant/{caster.name}_{axis_name}", 1.0, self._gain(i, axis))
         if self.has_imu:
 
             def scale(numbers: ModelNumbers, step: float) -> None:
@@ -265,6 +266,19 @@ class RobotProblemBuilder:
         def vary(numbers: ModelNumbers, step: float) -> None:
             numbers.radius[index] += step
             numbers.modules[index, 8] += step
+
+        return vary
+
+    def _gain(self, index: int, axis: int) -> Callable[[ModelNumbers, float], None]:
+        """Vary a torque constant against the mean of all.
+
+        What they share cannot be told from the masses. Left free it would be fitted below its value, since whoever scales
+        down all measured forces scales down their noise with them.
+        """
+
+        def vary(numbers: ModelNumbers, step: float) -> None:
+            numbers.gain[index, axis] += step
+            numbers.gain -= step / numbers.gain.size
 
         return vary
 
