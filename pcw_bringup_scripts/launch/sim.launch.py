@@ -10,6 +10,7 @@ from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 # name, default, meaning
@@ -46,7 +47,9 @@ def generate_launch_description() -> LaunchDescription:
             *(DeclareLaunchArgument(name, default_value=value, description=what) for name, value, what in ARGUMENTS),
             *(_part(*part) for part in PARTS),
             Node(
-                package="pcw_sim_bridge", executable="recorder", output="screen", parameters=[{"output": record}],
+                package="pcw_sim_bridge", executable="recorder", output="screen",
+                # A name that is a number stays a name.
+                parameters=[{"output": ParameterValue(record, value_type=str)}],
                 condition=IfCondition(PythonExpression(["'", record, "' != ''"])),
             ),
         ]

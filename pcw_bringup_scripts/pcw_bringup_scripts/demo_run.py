@@ -335,7 +335,9 @@ def run(arguments: argparse.Namespace) -> int:
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parse_arguments(args)
-    # A terminated demonstration ends its children as an interrupted one does.
+    # A terminated demonstration ends its children as an interrupted one does, also where a shell started it with SIGINT
+    # ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         return run(arguments)

@@ -180,6 +180,17 @@ def test_installation_holds_every_file_of_the_sources(package):
             assert files(REPOSITORY / package / folder) - files(share / folder) == set()
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_python_examples_of_a_readme_run_in_their_order(package, tmp_path):
+    """In one folder: a later one may read what an earlier one has written."""
+    text = (REPOSITORY / package / "README.md").read_text(encoding="utf-8")
+    examples = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert examples
+    for example in examples:
+        done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, timeout=250)
+        assert done.returncode == 0, done.stderr
+
+
 def test_only_the_packages_stand_at_the_top():
     visible = {name.partition("/")[0] for name in tracked_files() if not name.startswith(".")}
     assert visible - MAY_STAND_AT_THE_TOP == set()

@@ -43,7 +43,7 @@ class Robot:
     def __init__(self, ros, target=(0.3, 0.0, 0.0)):
         self.ros, self.target = ros, target
         self.time_ns, self.twist, self.position = -PERIOD_NS, np.zeros(3), np.zeros((4, 2))
-        self.commands, self.bad_velocity = [], False
+        self.commands, self.bad_velocity, self.bad_position = [], False, False
         self.states = ros.peer.create_publisher(JointState, "joint_states", 10)
         self.cmd_vel = ros.peer.create_publisher(TwistStamped, "cmd_vel", 1)
         ros.peer.create_subscription(JointState, "joint_commands", self._on_command, 1000)
@@ -65,6 +65,8 @@ class Robot:
         message = JointState(name=NAMES, position=self.position.ravel().tolist(), velocity=rates.ravel().tolist())
         if self.bad_velocity:
             message.velocity[3] = math.nan
+        if self.bad_position:
+            message.position[0] = math.nan
         message.header.stamp = ns_to_stamp(self.time_ns)
         self.states.publish(message)
 
@@ -152,6 +154,32 @@ def test_nan_in_lets_go_and_never_comes_out(ros):
     robot.run(robot.let_go)
     ros.wait_for(lambda: "refused: cmd_vel" in warnings_of(diagnostics))
     assert all(np.isfinite(command.effort).all() for command in robot.commands)
+
+
+def test_unusable_positions_do_not_make_it_race(ros):
+    """What moved meanwhile is divided by the time meanwhile: the robot was not faster than before."""
+    ros.start(CONTROLLER)
+    robot = Robot(ros)
+    robot.run(lambda: robot.drives() and abs(robot.twist[0] - 0.3) < 0.01)
+    robot.bad_position = True
+    until = robot.time_ns + 40_000_000
+    robot.run(lambda: robot.time_ns >= until and robot.let_go())
+    robot.bad_position, count, until = False, len(robot.commands), robot.time_ns + 400_000_000
+    robot.run(lambda: robot.time_ns >= until)
+    largest = max(np.abs(command.effort).max() for command in robot.commands[count:])
+    assert 0.0 < largest < 0.5 * THESIS.torque_limit.min()
+    assert abs(robot.twist[0] - 0.3) < 0.05
+
+
+def test_a_command_from_before_the_first_measurement_is_outdated(ros):
+    ros.start(CONTROLLER)
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    ros.wait_for(lambda: robot.cmd_vel.get_subscription_count() > 0)
+    ros.spin_for(0.3, while_doing=robot.publish_twist)
+    ros.wait_for(lambda: "no joint_states since the last report" in warnings_of(diagnostics))
+    robot.run(lambda: robot.time_ns > 400_000_000 and len(robot.commands) > 20, cmd_vel=False)
+    assert not any(np.any(command.effort) for command in robot.commands)
+    robot.run(robot.drives)
 
 
 def test_goes_to_a_goal(ros):

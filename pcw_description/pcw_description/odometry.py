@@ -78,12 +78,14 @@ class OdometryState:
         pose: pose of base_link in odom (x, y, yaw) [m, m, rad].
         pose_covariance: covariance of the pose in odom (3, 3).
         noise: what is known of the noise, (NOISE_SIZE + 4n,); see the layout above.
+        origin: pose (3,) and its covariance (3, 3) where this run of measurements began; None for a sure one.
     """
 
     joint_position: FloatArray | None
     pose: FloatArray
     pose_covariance: FloatArray
     noise: FloatArray
+    origin: tuple[FloatArray, FloatArray] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +107,20 @@ def initial_state(pose: FloatArray | None = None) -> OdometryState:
     """Return the state before the first measurement, at a known pose or the origin."""
     start = np.zeros(3) if pose is None else np.array(pose, dtype=float)
     return OdometryState(None, start, np.zeros((3, 3)), np.zeros(NOISE_SIZE))
+
+
+def interrupted(state: OdometryState, unseen: FloatArray | None = None) -> OdometryState:
+    """Return the state after measurements were missing: the pose is kept, and what is not known of it grows.
+
+    Args:
+        state: state after the last measurement.
+        unseen: motion (3,) [m, m, rad] in base_link that may have happened unseen, as a standard deviation; None for none.
+    """
+    covariance = state.pose_covariance
+    if unseen is not None:
+        c, s = math.cos(state.pose[2]), math.sin(state.pose[2])
+        covariance = covariance + _turned(np.diag(np.asarray(unseen, dtype=np.float64) ** 2), c, s)
+    return OdometryState(None, state.pose, covariance, np.zeros(NOISE_SIZE))
 
 
 @compiled
@@ -285,7 +301,9 @@ def update(
     if not np.isfinite(joint_position).all():
         raise KinematicsError("joint_position holds NaN or infinity; allowed: finite angles in rad")
     if state.joint_position is None:
-        first = OdometryState(joint_position, state.pose, state.pose_covariance, np.zeros(NOISE_SIZE + 4 * robot.n))
+        origin = (state.pose, state.pose_covariance) if state.pose_covariance.any() else None
+        noise = np.zeros(NOISE_SIZE + 4 * robot.n)
+        first = OdometryState(joint_position, state.pose, state.pose_covariance, noise, origin)
         return first, OdometryOutput(np.zeros(3), np.zeros((3, 3)), np.zeros((robot.n, 2)))
     if not 0.0 < dt < math.inf:
         raise KinematicsError(f"dt = {dt!r} s is not allowed; allowed: above 0 and finite, measured from stamps")
@@ -295,4 +313,7 @@ def update(
         float(parameters.residual_memory), float(parameters.drift_memory), state.noise,
     )
     output = OdometryOutput(increment / dt, increment_covariance / dt**2, residual / dt)
-    return OdometryState(joint_position, pose, covariance, noise), output
+    if state.origin is not None:
+        start, start_covariance = state.origin
+        covariance = covariance + _carried(start_covariance, pose[0] - start[0], pose[1] - start[1])
+    return OdometryState(joint_position, pose, covariance, noise, state.origin), output

@@ -236,11 +236,7 @@ class Recording:
         table = self._table("cmd_vel")
         if table is None:
             return None
-        prefix = ""
-        if self.topics[self.topic_names["cmd_vel"]].type_name == TWIST:
-            table.stamp_ns = self._header_time(table.log_time_ns)
-        else:
-            prefix = "twist."
+        prefix = "" if self.topics[self.topic_names["cmd_vel"]].type_name == TWIST else "twist."
         values = table.matrix([prefix + name for name in ("linear.x", "linear.y", "angular.z")])
         rows = table.clean(values, self.t0_ns)
         # no gaps here: a command is sent when somebody commands
@@ -319,7 +315,10 @@ class Recording:
         if name is None:
             return None
         raw = self._raw[name]
-        return MessageTable(topic, self.topics[name].type_name, raw.messages, raw.log_time_ns, self._log)
+        table = MessageTable(topic, self.topics[name].type_name, raw.messages, raw.log_time_ns, self._log)
+        if table.unstamped and topic != "joint_states":
+            table.stamp_ns = self._header_time(table.log_time_ns)
+        return table
 
     def _stamps(self, table: MessageTable, rows: RowArray) -> tuple[FloatArray, IntArray]:
         stamp_ns = table.stamp_ns[rows]

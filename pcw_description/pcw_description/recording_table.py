@@ -24,6 +24,7 @@ class MessageTable:
         groups: the decoded fields, one entry per layout.
         log_time_ns: (T,) when they were recorded [ns].
         stamp_ns: (T,) header stamps [ns]; the times of recording where the headers carry none.
+        unstamped: whether they carry none, or there are no headers.
         usable: (T,) those still good.
     """
 
@@ -46,6 +47,7 @@ class MessageTable:
 
     def _header_stamps(self) -> IntArray:
         stamp_ns = self.log_time_ns.copy()
+        self.unstamped = True
         if not any("header.stamp.sec" in group.numbers for group in self.groups):
             return stamp_ns  # a type without a header
         for group in self.groups:
@@ -54,6 +56,7 @@ class MessageTable:
         if np.mean(stamp_ns[self.usable] == 0) > 0.5:
             self.warn("unstamped", "the headers carry no stamps; the times of recording are used")
             return self.log_time_ns.copy()
+        self.unstamped = False
         return stamp_ns
 
     def matrix(self, paths: Sequence[str]) -> FloatArray:

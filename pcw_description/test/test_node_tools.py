@@ -22,6 +22,7 @@ from sensor_msgs.msg import JointState  # noqa: E402
 
 from pcw_description.errors import PcwError  # noqa: E402
 from pcw_description.nodes.node_tools import (  # noqa: E402
+    Silence,
     StampWatch,
     declare,
     fill_joint_state,
@@ -124,6 +125,28 @@ def test_a_stamp_watch_measures_and_counts() -> None:
     steps = [watch.update(ns_to_stamp(int(t * 1e9))) for t in (1.0, 1.25, 1.25, 1.5, 1.0, 1.125, 3.0, 3.25)]
     assert steps == [None, 0.25, None, 0.25, None, 0.125, None, 0.25]
     assert (watch.repeats, watch.backward_jumps, watch.gaps) == (1, 1, 1)
+
+
+def test_a_stamp_watch_leaves_out_what_was_of_no_use() -> None:
+    watch = StampWatch(longest_gap=0.5)
+    watch.update(ns_to_stamp(0))
+    assert watch.update(ns_to_stamp(100_000_000)) == 0.1
+    watch.take_back()
+    assert watch.update(ns_to_stamp(300_000_000)) == pytest.approx(0.3)
+    assert (watch.repeated, watch.last_gap) == (False, 0.0)
+    watch.update(ns_to_stamp(300_000_000))
+    assert watch.repeated
+    assert watch.update(ns_to_stamp(2_300_000_000)) is None
+    assert (watch.repeated, watch.last_gap) == (False, 2.0)
+
+
+def test_silence_is_what_came_to_nobody_since_the_last_report() -> None:
+    watch = StampWatch()
+    silence = Silence(watch)
+    assert silence.since_last_report()
+    watch.update(ns_to_stamp(0))
+    assert not silence.since_last_report()
+    assert silence.since_last_report()
 
 
 def test_joint_states_are_filled_in_order_and_nan_never_leaves() -> None:

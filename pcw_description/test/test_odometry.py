@@ -18,6 +18,7 @@ from pcw_description.odometry import (
     OdometryParameters,
     OdometryState,
     initial_state,
+    interrupted,
     update,
 )
 from pcw_description.robot_description import RobotDescription
@@ -285,6 +286,25 @@ def test_covariance_is_a_covariance_from_the_first_update_on() -> None:
             for covariance in (state.pose_covariance, output.twist_covariance):
                 np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-20)
                 assert np.linalg.eigvalsh(covariance).min() > 0.0
+
+
+def test_an_interruption_keeps_the_pose_and_what_is_not_known_of_it() -> None:
+    """The yaw's uncertainty at the interruption turns into a lateral one on the way on."""
+    robot = load_robot("thesis")
+    parameters, straight = OdometryParameters(), np.zeros((4, 2))
+    state = initial_state(np.array([1.0, 2.0, np.pi / 2.0]))
+    state = interrupted(state, np.array([0.2, 0.1, 0.05]))
+    np.testing.assert_allclose(np.sqrt(np.diag(state.pose_covariance)), [0.1, 0.2, 0.05], rtol=1e-12)
+    for _ in range(101):
+        state, _ = update(robot, parameters, state, straight, 0.01)
+        straight = straight + np.array([0.1, 0.0])
+    travelled = 10.0 * 0.075
+    np.testing.assert_allclose(state.pose[:2], [1.0, 2.0 + travelled], atol=1e-6)
+    lateral = np.hypot(0.1, 0.05 * travelled)
+    np.testing.assert_allclose(np.sqrt(np.diag(state.pose_covariance)), [lateral, 0.2, 0.05], rtol=1e-3)
+    again = interrupted(state)
+    np.testing.assert_array_equal(again.pose_covariance, state.pose_covariance)
+    np.testing.assert_array_equal(again.pose, state.pose)
 
 
 def test_standing_still_neither_adds_nor_forgets_uncertainty() -> None:

@@ -199,10 +199,11 @@ def test_without_a_robot_joints_come_by_name(robot: RobotDescription, tmp_path: 
         states["rear_left_driv"]
 
 
-def test_commands_contact_and_both_kinds_of_cmd_vel(robot: RobotDescription, tmp_path: Path) -> None:
-    """An unstamped Twist is placed in header time, here 5 s before the time of recording."""
+def test_commands_contact_and_all_kinds_of_cmd_vel(robot: RobotDescription, tmp_path: Path) -> None:
+    """A Twist, and a TwistStamped without a stamp, are placed in header time, here 5 s before the time of recording."""
     twist = np.array([0.1, -0.2, 0.3])
-    for path, stamped in ((tmp_path / "stamped", True), (tmp_path / "unstamped", False)):
+    for kind in ("stamped", "zero", "plain"):
+        path = tmp_path / kind
         with RecordingWriter(path) as writer:
             for row in range(100):
                 stamp_ns, log_time_ns = T0 + row * SECOND // 100, T0 + 5 * SECOND + row * SECOND // 100
@@ -211,8 +212,8 @@ def test_commands_contact_and_both_kinds_of_cmd_vel(robot: RobotDescription, tmp
                 writer.write("/joint_commands", joint_state(stamp_ns, robot.joint_names, effort=torque), log_time_ns)
                 wrench = ros_messages.wrench_stamped(stamp_ns, (1.0, 2.0, row), (0.0, 0.0, 0.0), "front_left_wheel")
                 writer.write("/contact/front_left/wrench", wrench, log_time_ns)
-                message = ros_messages.twist_stamped(stamp_ns, twist * row)
-                writer.write("/cmd_vel", message if stamped else message.twist, log_time_ns)
+                message = ros_messages.twist_stamped(0 if kind == "zero" else stamp_ns, twist * row)
+                writer.write("/cmd_vel", message.twist if kind == "plain" else message, log_time_ns)
         recording = Recording.open(path, robot)
         assert recording.joint_commands is not None and recording.cmd_vel is not None
         np.testing.assert_array_equal(recording.joint_commands.effort[:, 0, 0], np.arange(100.0))
@@ -221,7 +222,8 @@ def test_commands_contact_and_both_kinds_of_cmd_vel(robot: RobotDescription, tmp
         np.testing.assert_allclose(recording.cmd_vel.stamp, np.arange(100) / 100, atol=1e-9)
         np.testing.assert_array_equal(recording.contact["front_left"].force[:, 2], np.arange(100.0))
         assert recording.contact["front_left"].frame_id == "front_left_wheel"
-        assert set(codes(recording)) == {"missing_field"}  # no velocity, no effort was measured here
+        # No velocity and no effort was measured here.
+        assert set(codes(recording)) == {"missing_field"} | ({"unstamped"} if kind == "zero" else set())
 
 
 def test_any_topic_is_there_raw_and_as_columns(robot: RobotDescription, tmp_path: Path) -> None:

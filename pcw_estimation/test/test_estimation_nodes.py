@@ -125,6 +125,25 @@ def test_odometry_keeps_its_pose_over_a_gap_and_unusable_joints(ros):
     values = {v.key: v.value for s in diagnostics[-1].status for v in s.values}
     assert values["gaps"] == "1"
 
+    # Forty milliseconds without a usable measurement are no haste.
+    turning = robot.position.copy()
+    for _ in range(20):
+        robot.position[2, 0] = math.nan
+        robot.publish(1)
+        ros.spin_once()
+    robot.position[2, 0] = turning[2, 0] + (robot.position[1, 0] - turning[1, 0])
+    count = len(odom)
+    robot.run(lambda: len(odom) > count + 5)
+    assert max(m.twist.twist.linear.x for m in odom[count:]) < 0.6
+
+
+def test_silence_is_reported(ros):
+    ros.start("pcw_estimation.nodes.odometry")
+    ros.start("pcw_estimation.nodes.encoder_slip")
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+    said = lambda: {s.name for d in diagnostics for s in d.status if "no joint_states" in s.message}  # noqa: E731
+    ros.wait_for(lambda: said() == {"odometry: odometry", "encoder_slip: slip"})
+
 
 def test_slip_names_the_wheel_and_never_sends_what_it_does_not_know(ros):
     node = ros.start("pcw_estimation.nodes.encoder_slip")

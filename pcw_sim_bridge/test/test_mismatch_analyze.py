@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcw_description import load_robot, parse_robot
+from pcw_description import load_robot, parse_robot, ros_messages
 from pcw_description.axis_recording import parse_axis_description
 from pcw_description.description_fields import load_yaml_mapping
 from pcw_description.effects.effect import EffectInstance
+from pcw_description.recording import Recording
+from pcw_description.recording_writer import RecordingWriter
 from pcw_sim_bridge.simulated_run import record_run
 
 LINEAR_AXIS = """\
@@ -176,6 +178,33 @@ def test_a_healthy_robot_has_nothing_missing(tmp_path: Path) -> None:
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["effects"] == []
     assert report["verdict"] == "no_mismatch"
+
+
+def test_sensors_that_only_some_recordings_have_are_refused_and_missing_ones_told(tmp_path: Path) -> None:
+    """Without torques nothing is said of forces, and a hold-out with others than the fitted recordings proves nothing."""
+    nominal = load_robot("thesis")
+    record_run(nominal, wandering, 8.0, 5, tmp_path / "whole", "reduced")
+    joints = Recording.open(tmp_path / "whole", nominal).joint_states
+    with RecordingWriter(tmp_path / "no_effort") as writer:
+        for stamp_ns, position, velocity in zip(joints.stamp_ns, joints.position, joints.velocity, strict=True):
+            message = ros_messages.joint_state(
+                int(stamp_ns), nominal.joint_names, position=position.ravel(), velocity=velocity.ravel()
+            )
+            writer.write("/joint_states", message, int(stamp_ns))
+        imu = Recording.open(tmp_path / "whole", nominal).imu
+        assert imu is not None
+        for stamp_ns, gyro, acceleration in zip(imu.stamp_ns, imu.gyro, imu.acceleration, strict=True):
+            writer.write("/imu/data", ros_messages.imu(int(stamp_ns), gyro, acceleration), int(stamp_ns))
+    done = analyze(
+        tmp_path / "whole", "--robot", "thesis", "--out", tmp_path / "report", "--holdout", tmp_path / "no_effort"
+    )
+    assert done.returncode == 2
+    assert "no_effort has no effort in joint_states, and" in done.stderr
+    assert not (tmp_path / "report").exists()
+    done = analyze(tmp_path / "no_effort", "--robot", "thesis", "--out", tmp_path / "report")
+    assert done.returncode == 0, done.stderr
+    assert "(forces could not be judged)" in done.stdout
+    assert "forces could not be judged" in (tmp_path / "report" / "report.html").read_text()
 
 
 def test_same_seed_same_report(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from pcw_description.nodes.node_tools import (
     COMMAND,
     COMMAND_SOURCE,
     SENSOR,
+    Silence,
     StampWatch,
     declare,
     fill_joint_state,
@@ -87,6 +88,7 @@ class ComputedTorqueNode(LifecycleNode):
     def _forget(self) -> None:
         """Start afresh: nothing commanded, nothing measured."""
         self._watch = StampWatch(LONGEST_GAP)
+        self._silence = Silence(self._watch)
         self._odometry = odometry.initial_state()
         self._state = initial_state()
         self._engaged = False  # a torque other than zero may be out
@@ -166,6 +168,8 @@ class ComputedTorqueNode(LifecycleNode):
         if not np.isfinite(values).all() or frame not in ("", "base_link"):
             self._refuse(f"cmd_vel {values.tolist()} in frame {frame!r}; allowed: finite numbers in base_link")
             values = None
+        if self._now_ns < 0:
+            values = None  # no measurement yet to date it by: once the robot speaks, it may be long outdated
         self._twist, self._twist_ns = values, self._now_ns
         self._trajectory = None
 
@@ -243,7 +247,12 @@ class ComputedTorqueNode(LifecycleNode):
         if dt is None:
             # Before the first dt there is no odometry; after a gap or a jump the pose is kept and the motion between unknown.
             self._odometry = odometry.initial_state(self._odometry.pose)
-        self._odometry, moved = odometry.update(self.robot, ODOMETRY, self._odometry, position, dt or 1.0)
+        try:
+            self._odometry, moved = odometry.update(self.robot, ODOMETRY, self._odometry, position, dt or 1.0)
+        except PcwError:
+            # The motion since the last usable position is divided by the time since then, or the robot would seem fast.
+            self._watch.take_back()
+            raise
         reference = self._reference()
         if dt is None or reference is None or self._fault:
             self._disengage()
@@ -289,6 +298,8 @@ class ComputedTorqueNode(LifecycleNode):
             level, message = ERROR, f"latched: {self._fault}"
         elif problems:
             level, message = WARN, problems
+        elif self._silence.since_last_report():
+            level, message = WARN, "no joint_states since the last report; the torque is zero"
         else:
             following = "a trajectory" if self._trajectory is not None else "cmd_vel" if self._engaged else "nothing"
             level, message = OK, f"following {following}"

@@ -293,16 +293,23 @@ class StampWatch:
         self.repeats = 0
         self.backward_jumps = 0
         self.gaps = 0
+        self.count = 0
+        self.repeated = False
+        self.last_gap = 0.0  # [s]; the gap that the last stamp ended, 0 where it ended none
         self._last_ns: int | None = None
+        self._before_ns: int | None = None
 
     def update(self, stamp: Time) -> float | None:
         """Return dt [s] since the stamp before, or None where there is no dt to compute with.
 
-        None for the first stamp, a repeated stamp, a jump back, and a gap longer than `longest_gap` [s]; the
-        next dt is measured from this stamp.
+        None for the first stamp, a repeated stamp (`repeated` says so), a jump back, and a gap longer than
+        `longest_gap` [s]; the next dt is measured from this stamp.
         """
         now_ns = stamp_to_ns(stamp)
-        last_ns, self._last_ns = self._last_ns, now_ns
+        self._before_ns = last_ns = self._last_ns
+        self._last_ns = now_ns
+        self.count += 1
+        self.repeated, self.last_gap = now_ns == last_ns, 0.0
         if last_ns is None:
             return None
         dt = (now_ns - last_ns) * 1e-9
@@ -312,9 +319,26 @@ class StampWatch:
             self.backward_jumps += 1
         elif dt > self.longest_gap:
             self.gaps += 1
+            self.last_gap = dt
         else:
             return dt
         return None
+
+    def take_back(self) -> None:
+        """Say that the message of the last stamp was of no use: the next dt is measured from the stamp before."""
+        self._last_ns = self._before_ns
+
+
+class Silence:
+    """Says whether a stream went silent between two reports."""
+
+    def __init__(self, watch: StampWatch) -> None:
+        self._watch, self._count = watch, 0
+
+    def since_last_report(self) -> bool:
+        """Whether nothing has come since the last call."""
+        silent, self._count = self._watch.count == self._count, self._watch.count
+        return silent
 
 
 class Decimator:

@@ -14,6 +14,7 @@ from pcw_description.nodes.node_tools import (
     SENSOR_SOURCE,
     SENSOR_STREAM,
     Decimator,
+    Silence,
     StampWatch,
     declare,
     fill_joint_state,
@@ -52,6 +53,7 @@ class EncoderSlipNode(Node):
         encoder_slip.step(self.robot, self._thresholds, self._state, at_rest, at_rest, 0.0)
         self._output: encoder_slip.EncoderSlipOutput | None = None
         self._watch = StampWatch()
+        self._silence = Silence(self._watch)
         self._decimator = Decimator(rate)
         self._unusable, self._problems = 0, Problems(self)
         self._ever = np.zeros((self.robot.n, 2), dtype=bool)  # flagged since the last report
@@ -68,12 +70,15 @@ class EncoderSlipNode(Node):
 
     def _on_joint_states(self, message: JointState) -> None:
         dt = self._watch.update(message.header.stamp)
+        if self._watch.repeated:
+            return
         position, velocity, _ = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
         if dt is None:
             self._state = encoder_slip.initial_state(self.robot)
         try:
             self._state, output = encoder_slip.step(self.robot, self._thresholds, self._state, position, velocity, dt or 0.0)
         except PcwError as error:
+            self._watch.take_back()
             self._unusable += 1
             self._problems.add(str(error))
             return
@@ -103,6 +108,8 @@ class EncoderSlipNode(Node):
             level, text = WARN, "slip since the last report: " + ", ".join(flagged)
         elif problems:
             level, text = WARN, problems
+        elif self._silence.since_last_report():
+            level, text = WARN, "no joint_states since the last report"
         return Status(level, text, values)
 
 

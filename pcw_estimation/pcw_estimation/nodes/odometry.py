@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -18,6 +17,7 @@ from pcw_description.nodes.node_tools import (
     SENSOR_SOURCE,
     SENSOR_STREAM,
     Decimator,
+    Silence,
     StampWatch,
     declare,
     joint_state_arrays,
@@ -59,7 +59,8 @@ class OdometryNode(Node):
         )
         self._parameters_of_odometry = odometry.OdometryParameters(method, memory)
         self._state = odometry.initial_state()
-        self._watch = StampWatch(longest_gap)
+        self._watch, self._twist = StampWatch(longest_gap), np.zeros(3)
+        self._silence = Silence(self._watch)
         self._decimator = Decimator(rate)
         self._clear_mean()
         self._unusable, self._problems = 0, Problems(self)
@@ -82,19 +83,24 @@ class OdometryNode(Node):
     def _on_joint_states(self, message: JointState) -> None:
         position, _, _ = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
         dt = self._watch.update(message.header.stamp)
+        if self._watch.repeated:
+            return
         if dt is None:
-            self._state = dataclasses.replace(self._state, joint_position=None)
+            # In a gap the robot may have gone on as it went before; after a jump back nobody knows.
+            self._state = odometry.interrupted(self._state, self._twist * self._watch.last_gap)
             self._clear_mean()
         try:
             self._state, output = odometry.update(
                 self.robot, self._parameters_of_odometry, self._state, position, dt if dt is not None else 1.0
             )
         except PcwError as error:
+            self._watch.take_back()
             self._unusable += 1
             self._problems.add(str(error))
             return
         if dt is None:
             return
+        self._twist = output.twist
         self._duration += dt
         self._moved += output.twist * dt
         self._moved_covariance += output.twist_covariance * dt**2
@@ -122,6 +128,8 @@ class OdometryNode(Node):
     def _status(self) -> Status:
         problems = self._problems.take()
         level, text = (WARN, problems) if problems else (OK, "integrating")
+        if self._silence.since_last_report():
+            level, text = WARN, "no joint_states since the last report"
         return Status(
             level, text,
             {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -227,7 +228,10 @@ def _retuned(problem: RegressionProblem, fit: Fit) -> tuple[RetunedFinding, ...]
     for nuisance, change, deviation in zip(problem.nuisances, fit.mean, deviations, strict=False):
         moved = abs(change) > max(RETUNED_SIGNIFICANCE * deviation, 0.1 * nuisance.deviation)
         if moved or deviation < DETERMINED_PART * nuisance.deviation:
-            value, half = nuisance.nominal + float(change), 1.96 * float(deviation)
+            value = nuisance.nominal + float(change)
+            # Masses are weighed against the torques: no better than these are known.
+            scale = problem.scale_deviation * value if nuisance.unit.startswith("kg") else 0.0
+            half = 1.96 * math.hypot(float(deviation), scale)
             found.append(
                 RetunedFinding(
                     nuisance.name, nuisance.unit, nuisance.nominal, value, value - half, value + half, nuisance.deviation
@@ -266,11 +270,8 @@ def _prove(
     spread = np.maximum(_rms(proof.measured - _mean(proof.measured, rows), rows), 1e-300)
     before = _nrmse(proof.residual, rows, spread)
     after = _nrmse(proof.residual - predicted(proof, fit), rows, spread)
-    floor = _nrmse(
-        regression.unwhitened_residual(selection.fit), problem.valid,
-        np.maximum(_rms(problem.measured - _mean(problem.measured, problem.valid), problem.valid), 1e-300),
-    )
-    closed = (before - after) / (before - floor) if before > floor else 1.0 if after <= before else 0.0
+    floor = float(np.sqrt(np.mean((explanation.floor / spread) ** 2)))
+    closed = (before - after) / (before - floor) if before > floor else 0.0
     data = held_out or opened
     nominal_rollout, patched_rollout = subject.rollout(data), patched.rollout(data)
     both = {name: (nominal_rollout[name], patched_rollout[name]) for name in nominal_rollout}

@@ -107,7 +107,7 @@ class FitFinding:
         source: what was held out, in words.
         inverse_nrmse: of the measured side of the channels, before and after.
         rollout: of forward simulation, by signal.
-        gap_closed: (before - after) / (before - floor).
+        gap_closed: (before - after) / (before - floor), the floor being noise; 0 where there is no gap.
     """
 
     source: str
@@ -231,10 +231,16 @@ class Findings:
             "seconds": self.seconds,
         }
 
+    def limits(self) -> str:
+        """What a verdict does not cover, as words after "nothing is missing"; "" where forces were judged."""
+        if any("force" in channel.name for channel in self.channels):
+            return ""
+        return f" in {', '.join(channel.name for channel in self.channels)} (forces could not be judged)"
+
     def summary(self) -> list[str]:
         """Return five plain lines: subject, verdict, effects, held-out fit, warnings."""
         verdict = {
-            "no_mismatch": "nothing is missing: what differs is within noise and tolerances",
+            "no_mismatch": f"nothing is missing{self.limits()}: what differs is within noise and tolerances",
             "explained": "explained: the effects below account for the mismatch",
             "partly_explained": "partly explained: the effects below, and a leftover that is not in the library",
             "unexplained": "not explained by any effect of the library",
@@ -247,8 +253,8 @@ class Findings:
             fit = "no held-out data"
         else:
             before, after = self.fit.inverse_nrmse
-            closed = f"{100 * self.fit.gap_closed:.0f} % of the gap closed"
-            fit = f"NRMSE {before:.3f} before, {after:.3f} after; {closed} ({self.fit.source})"
+            closed = f"; {100 * self.fit.gap_closed:.0f} % of the gap closed" if self.effects else ""
+            fit = f"NRMSE {before:.3f} before, {after:.3f} after{closed} ({self.fit.source})"
         warnings = sum(len(i.warnings) for i in self.inputs)
         return [
             f"Subject:   {self.subject}",

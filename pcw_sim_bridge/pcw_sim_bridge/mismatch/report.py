@@ -34,7 +34,7 @@ PERSONS = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
 SHORT_LIST = 12  # rows of the ladder that are shown unfolded
 
 HEADLINES = {
-    "no_mismatch": "Nothing is missing. Whatever differs is within the noise and the tolerances of the description.",
+    "no_mismatch": "Nothing is missing{}. Whatever differs is within the noise and the tolerances of the description.",
     "explained": "Explained. The following, added to the description, accounts for what was recorded.",
     "partly_explained": "Partly explained. Beside what can be named there is a leftover from outside the library of effects.",
     "unexplained": "Not explained. Recording and model part, and no effect of the library accounts for it.",
@@ -339,7 +339,7 @@ def report_html(findings: Findings, figures: list[TraceFigures], patched: Mappin
     physics = None if patched is None else patched.get("physics")
     return environment.get_template(TEMPLATE).render(
         findings=findings,
-        headline=HEADLINES[findings.verdict],
+        headline=HEADLINES[findings.verdict].format(findings.limits()),
         badge=BADGES[findings.verdict],
         effects=[
             (effect, [(name, *_with_interval(p), p.unit) for name, p in effect.parameters.items()])

@@ -15,6 +15,7 @@ from pcw_description.recording import Recording
 from pcw_description.robot_description import STEER, RobotDescription, load_robot, robot_to_mapping
 
 from ..plants.reduced import ReducedPlant
+from .errors import MismatchError
 from .findings import InputFinding
 from .regression_problem import RegressionProblem
 from .robot_channels import RobotProblemBuilder
@@ -34,6 +35,7 @@ class RobotSubject:
         self.robot = robot
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
+        self._sensors: tuple[Path, tuple[bool, bool]] | None = None
 
     @classmethod
     def load(cls, path: Path) -> RobotSubject:
@@ -43,8 +45,23 @@ class RobotSubject:
     def open(self, path: Path, role: str, topics: Mapping[str, str]) -> Opened:
         """Read one rosbag2 folder or file."""
         recording = Recording.open(path, self.robot, topics)
+        self._check_sensors(path, recording)
         warnings = tuple(f"{warning.topic}: {warning.text}" for warning in recording.warnings)
         return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, warnings))
+
+    def _check_sensors(self, path: Path, recording: Recording) -> None:
+        """All recordings of one analysis have the same channels, those held out too."""
+        effort = recording.joint_states.effort
+        present = (effort is not None and bool(np.isfinite(effort).any()), recording.imu is not None)
+        if self._sensors is None:
+            self._sensors = path, present
+        first, expected = self._sensors
+        for name, here, there in zip(("effort in joint_states", "imu/data"), present, expected, strict=True):
+            if here != there:
+                has, lacks = (path, first) if here else (first, path)
+                raise MismatchError(
+                    f"{lacks} has no {name}, and {has} has; allowed: recordings with the same sensors in one analysis"
+                )
 
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem."""

@@ -198,6 +198,8 @@ class BridgeNode(Node):
             self._advance()
         duration = self.get_parameter("step_duration").value
         for _ in range(max(1, round(duration / self._simulated.control_period))):
+            if self._fault:
+                break
             self._advance()
         response.success, response.message = not self._fault, self._fault or f"time {self._simulated.time_ns * 1e-9:.6f} s"
         return response
