@@ -35,8 +35,10 @@ from pcw_description.augmented_object_model import AugmentedObjectModel
 from pcw_description.errors import PcwError
 from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
-from pcw_description.robot_description import DRIVE, STEER, RobotDescription, load_robot
-from pcw_sim_bridge.plants.plant import Plant, make_plant
+from pcw_description.robot_description import DRIVE, STEER, RobotDescription
+from pcw_description.robot_file import load_robot
+from pcw_sim_bridge.plants.factory import make_plant
+from pcw_sim_bridge.plants.plant import Plant
 from pcw_sim_bridge.sensors import JointReading
 from pcw_sim_bridge.simulated_robot import JointCommand, SimulatedRobot
 

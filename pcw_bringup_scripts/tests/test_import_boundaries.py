@@ -9,6 +9,7 @@ reading cannot: an import by name, or a package whose `__init__` drags its nodes
 from __future__ import annotations
 
 import ast
+import graphlib
 import os
 import subprocess
 import sys
@@ -133,6 +134,23 @@ def test_every_package_has_source_files():
 def test_imports_only_point_left(package, path):
     source = (REPOSITORY / package / package / path).read_text(encoding="utf-8")
     assert violations(package, path, source) == []
+
+
+def module_name(package: str, path: str) -> str:
+    parts = [package, *PurePosixPath(path).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Imports inside a function and imports for types alone count too: they are arrows as well."""
+    modules = {module_name(package, path): (package, path) for package, path in source_files()}
+    arrows = {}
+    for name, (package, path) in modules.items():
+        tree = ast.parse((REPOSITORY / package / package / path).read_text(encoding="utf-8"))
+        used = imported_modules(tree, package, PurePosixPath(path)) & set(modules)
+        # `from . import x` names the package that x is in; the package's own __init__ is not what is meant.
+        arrows[name] = {other for other in used if other != name and not name.startswith(f"{other}.")}
+    graphlib.TopologicalSorter(arrows).prepare()  # raises CycleError, which names the circle
 
 
 @pytest.mark.parametrize(

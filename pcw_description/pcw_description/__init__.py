@@ -11,17 +11,8 @@ from .differential_kinematics import (
 )
 from .displacement_kinematics import forward_displacement, inverse_displacement
 from .errors import DescriptionError, KinematicsError, PcwError
-from .robot_description import (
-    DRIVE,
-    LATERAL,
-    LONGITUDINAL,
-    STEER,
-    RobotDescription,
-    load_robot,
-    parse_robot,
-    save_robot,
-    shipped_robots,
-)
+from .robot_description import DRIVE, LATERAL, LONGITUDINAL, STEER, RobotDescription
+from .robot_file import load_robot, parse_robot, save_robot, shipped_robots
 
 __all__ = [
     "DRIVE",

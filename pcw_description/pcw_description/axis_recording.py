@@ -26,10 +26,11 @@ import numpy.typing as npt
 import yaml
 
 from .description_fields import load_yaml_mapping, quantity, read_section, section, text
-from .effects.effect import EffectInstance
+from .effects.effect_instance import EffectInstance
 from .effects.registry import read_physics
 from .errors import DescriptionError, PcwError, nearest_name
-from .robot_description import Tolerance, read_tolerances
+from .robot_description import Tolerance
+from .robot_file import read_tolerances
 
 FORMAT = "pcw_axis/1"
 TARGET = "axis"

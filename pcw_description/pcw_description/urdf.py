@@ -25,7 +25,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .errors import DescriptionError, PcwError
-from .robot_description import Caster, RobotDescription, load_robot, thinnest_module_inertia
+from .robot_description import Caster, RobotDescription, thinnest_module_inertia
+from .robot_file import load_robot
 
 # Looks only: radius of the steering column, and how much of the wheel's radius the fork's blade is thick.
 COLUMN_RADIUS = 0.03

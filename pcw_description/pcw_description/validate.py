@@ -9,7 +9,8 @@ from collections.abc import Iterable, Sequence
 from .description_fields import document
 from .effects.registry import all_effects
 from .errors import PcwError
-from .robot_description import DEFAULT_TOLERANCES, RobotDescription, load_robot, shipped_robots
+from .robot_description import DEFAULT_TOLERANCES, RobotDescription
+from .robot_file import load_robot, shipped_robots
 
 CASTER_DEFAULTS = (
     "caster_defaults", "", "optional", "what all casters share, with the keys of a caster; each caster overrides it",

@@ -24,7 +24,8 @@ from pcw_description import (
     parse_robot,
     shipped_robots,
 )
-from pcw_description.robot_description import MINIMUM_CASTER_OFFSET, RobotDescription, robot_to_mapping
+from pcw_description.robot_description import MINIMUM_CASTER_OFFSET, RobotDescription
+from pcw_description.robot_file import robot_to_mapping
 
 ROBOTS = tuple(
     name

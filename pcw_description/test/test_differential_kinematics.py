@@ -22,7 +22,8 @@ from pcw_description import (
     wheel_jacobian,
 )
 from pcw_description.differential_kinematics import forward_kinematics_kernel, joint_matrix_blocks
-from pcw_description.robot_description import MINIMUM_CASTER_OFFSET, RobotDescription, robot_to_mapping
+from pcw_description.robot_description import MINIMUM_CASTER_OFFSET, RobotDescription
+from pcw_description.robot_file import robot_to_mapping
 
 ROBOTS = shipped_robots()
 ROLLING_ROBOTS = tuple(

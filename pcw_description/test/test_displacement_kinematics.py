@@ -24,7 +24,8 @@ from pcw_description import (
     shipped_robots,
     wheel_centres,
 )
-from pcw_description.robot_description import MINIMUM_CASTER_OFFSET, robot_to_mapping
+from pcw_description.robot_description import MINIMUM_CASTER_OFFSET
+from pcw_description.robot_file import robot_to_mapping
 
 ROBOTS = tuple(
     name

@@ -20,7 +20,7 @@ from pcw_description import (
     wheel_jacobian,
 )
 from pcw_description.mobility import is_omnidirectional, planar_mobility, robot_mobility
-from pcw_description.robot_description import robot_to_mapping
+from pcw_description.robot_file import robot_to_mapping
 from pcw_description.singularity import analyse, find_singular_configuration, full_actuation_determinant
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

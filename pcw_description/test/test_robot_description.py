@@ -28,13 +28,8 @@ from pcw_description import (
     wheel_jacobian,
 )
 from pcw_description.contact.contact_model import tyre_parameters
-from pcw_description.robot_description import (
-    DEFAULT_TOLERANCES,
-    DRIVE,
-    STEER,
-    robot_to_mapping,
-    robots_directory,
-)
+from pcw_description.robot_description import DEFAULT_TOLERANCES, DRIVE, STEER
+from pcw_description.robot_file import robot_to_mapping, robots_directory
 
 SHIPPED = ("dyros_pcv", "flow_base", "mpo700", "thesis", "tidybot2", "xr4000")
 TORQUE_CONTROLLED = tuple(name for name in SHIPPED if name != "mpo700")

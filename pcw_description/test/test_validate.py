@@ -13,13 +13,8 @@ import pytest
 
 from pcw_description.description_fields import document, quantity, section, text
 from pcw_description.effects.registry import all_effects
-from pcw_description.robot_description import (
-    DEFAULT_TOLERANCES,
-    load_robot,
-    robot_to_mapping,
-    robots_directory,
-    shipped_robots,
-)
+from pcw_description.robot_description import DEFAULT_TOLERANCES
+from pcw_description.robot_file import load_robot, robot_to_mapping, robots_directory, shipped_robots
 from pcw_description.validate import effects_table, keys_table, main, tolerances_table
 
 README = Path(__file__).parents[1] / "README.md"

@@ -18,7 +18,7 @@ from pcw_description.recording_writer import RecordingWriter
 from pcw_description.robot_description import FloatArray, RobotDescription
 from pcw_description.ros_messages import imu, joint_state, odometry, twist_stamped
 
-from .plants.plant import make_plant
+from .plants.factory import make_plant
 from .sensors import ImuReading, JointReading
 from .simulated_robot import JointCommand, Sample, SimulatedRobot, TrackedPose
 

@@ -10,7 +10,7 @@ from pcw_control.quintic_trajectory import TrajectoryPoint
 from pcw_description import load_robot
 from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
-from pcw_sim_bridge.plants.plant import make_plant
+from pcw_sim_bridge.plants.factory import make_plant
 
 DURATION = 12.0
 RAMP = 2.0

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_description.effects.effect import EffectInstance
+from pcw_description.effects.effect_instance import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER
-from pcw_sim_bridge.plants.plant import PlantError, make_plant
+from pcw_sim_bridge.plants.factory import make_plant
+from pcw_sim_bridge.plants.plant import PlantError
 from pcw_sim_bridge.traction_test import measure_traction, traction_rig
 
 # The springs of the PyBullet plant pitch and roll by a fraction of a milliradian, the reduced plant does not.

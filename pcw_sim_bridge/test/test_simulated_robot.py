@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pcw_description import inverse_kinematics, load_robot
-from pcw_sim_bridge.plants.plant import PlantError, PlantState, make_plant
+from pcw_sim_bridge.plants.factory import make_plant
+from pcw_sim_bridge.plants.plant import PlantError, PlantState
 from pcw_sim_bridge.sensors import ImuReading, JointReading
 from pcw_sim_bridge.simulated_robot import JointCommand, SimulatedRobot, TrackedPose
 

@@ -23,8 +23,8 @@ from pcw_description.robot_description import (
     ContactDescription,
     LateralContact,
     RobotDescription,
-    load_robot,
 )
+from pcw_description.robot_file import load_robot
 
 BURCKHARDT = "Burckhardt 1993"
 

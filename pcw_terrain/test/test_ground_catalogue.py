@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from pcw_description import DescriptionError, load_robot, parse_robot
 from pcw_description.contact.contact_model import friction_coefficient, tyre_parameters
-from pcw_description.robot_description import CONTACT_MODELS, robot_to_mapping
+from pcw_description.robot_description import CONTACT_MODELS
+from pcw_description.robot_file import robot_to_mapping
 from pcw_terrain import GROUNDS, Ground, contact_on, ground, robot_on
 from pcw_terrain.ground_catalogue import main, table
 

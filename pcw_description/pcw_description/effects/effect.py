@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..compiled import joint_torque_along, joint_torque_list
 from ..errors import DescriptionError, nearest_name
-
-if TYPE_CHECKING:
-    from ..robot_description import RobotDescription
+from ..robot_description import RobotDescription
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -41,25 +39,6 @@ class EffectParameter:
     typical: float
     default: float | None = None
     linear: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class EffectInstance:
-    """An effect at work in a robot description.
-
-    Attributes:
-        name: name of the effect in the vocabulary.
-        target: caster names, or ("chassis",), ("imu",), ("clock",).
-        parameters: values by name, defaults filled in.
-    """
-
-    name: str
-    target: tuple[str, ...]
-    parameters: Mapping[str, float]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the entry as it stands under `physics:`."""
-        return {"name": self.name, "target": list(self.target), **dict(self.parameters)}
 
 
 @dataclasses.dataclass(frozen=True)

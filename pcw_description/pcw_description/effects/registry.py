@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import DescriptionError, nearest_name
-from .effect import Effect, EffectInstance
+from .effect import Effect
+from .effect_instance import EffectInstance
 
 ENTRY_POINT_GROUP = "pcw_description.effects"
 _NOT_EFFECTS = ("effect", "registry")

@@ -10,7 +10,7 @@ import sys
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from ..robot_description import load_robot
+from ..robot_file import load_robot
 from ..urdf import robot_urdf
 from .node_tools import LATCHED, declare, run_node
 

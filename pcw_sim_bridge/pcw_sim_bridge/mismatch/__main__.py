@@ -59,8 +59,8 @@ def run_analyze(options: argparse.Namespace) -> int:
     # Imported here so that --help and bad input answer at once.
     from .analysis import analyse
     from .errors import MismatchError
+    from .load_subject import load_subject
     from .report import check_output, write_report
-    from .subject import load_subject
 
     topics = {}
     for remap in options.topic:

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pcw_description.effects.effect import EffectInstance
+from pcw_description.effects.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
-from pcw_description.robot_description import STEER, RobotDescription, load_robot, robot_to_mapping
+from pcw_description.robot_description import STEER, RobotDescription
+from pcw_description.robot_file import load_robot, robot_to_mapping
 
 from ..plants.reduced import ReducedPlant
 from .errors import MismatchError

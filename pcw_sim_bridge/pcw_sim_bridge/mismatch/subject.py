@@ -8,13 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from pcw_description.axis_recording import FORMAT as AXIS_FORMAT
-from pcw_description.description_fields import load_yaml_mapping
-from pcw_description.effects.effect import EffectInstance
-from pcw_description.robot_description import FORMAT as ROBOT_FORMAT
-from pcw_description.robot_description import robots_directory, shipped_robots
+from pcw_description.effects.effect_instance import EffectInstance
 
-from .errors import MismatchError
 from .findings import InputFinding
 from .regression_problem import RegressionProblem
 
@@ -56,30 +51,6 @@ class Subject(Protocol):
 
     def rollout(self, opened: Sequence[Opened]) -> dict[str, float]:
         """Return the error of forward simulation over short windows, per signal, relative to the signal's spread."""
-
-
-def load_subject(description: str) -> Subject:
-    """Load a description of either kind.
-
-    Args:
-        description: path of a `pcw_robot/1` or `pcw_axis/1` file, or the name of a shipped robot.
-
-    Raises:
-        PcwError: no such file, or it is not valid.
-    """
-    path = Path(description)
-    if path.suffix not in (".yaml", ".yml") and description in shipped_robots():
-        path = robots_directory() / f"{description}.yaml"
-    found = load_yaml_mapping(path).get("format")
-    if found == AXIS_FORMAT:
-        from .axis_subject import AxisSubject
-
-        return AxisSubject.load(path)
-    if found == ROBOT_FORMAT:
-        from .robot_subject import RobotSubject
-
-        return RobotSubject.load(path)
-    raise MismatchError(f"{path}: format is {found!r}; allowed: {ROBOT_FORMAT} or {AXIS_FORMAT}")
 
 
 def file_digest(path: Path) -> str:

@@ -15,7 +15,8 @@ from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.node_tools import COMMAND, declare, joint_state_arrays, run_node, stamp_to_ns
 
-from ..plants.plant import PLANT_NAMES, PlantError, make_plant
+from ..plants.factory import make_plant
+from ..plants.plant import PLANT_NAMES, PlantError
 from ..sensors import VELOCITY_SOURCES
 from ..simulated_robot import JointCommand, SimulatedRobot
 from .bridge_messages import BridgePublishers

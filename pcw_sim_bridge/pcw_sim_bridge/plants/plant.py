@@ -61,30 +61,3 @@ class Plant(Protocol):
 
     def close(self) -> None:
         """Free what the plant holds."""
-
-
-def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool = False) -> Plant:
-    """Make a plant of the robot.
-
-    Args:
-        name: "reduced" (planar, compiled) or "pybullet" (three-dimensional).
-        robot: the robot, with the effects of its `physics` at work.
-        dt: step [s].
-        gui: show a window (PyBullet only).
-
-    Raises:
-        PlantError: unknown name or a step that is not in 0.0001 to 0.005 s.
-        KinematicsError: the robot cannot be torque controlled.
-    """
-    if name not in PLANT_NAMES:
-        raise PlantError(f"plant {name!r} is not allowed; allowed: {', '.join(PLANT_NAMES)}")
-    if not 1e-4 <= dt <= 5e-3:
-        raise PlantError(f"dt = {dt!r} s is not allowed; allowed: 0.0001 to 0.005 s")
-    robot.require_torque_control()
-    if name == "reduced":
-        from .reduced import ReducedPlant
-
-        return ReducedPlant(robot, dt)
-    from .pybullet_plant import PybulletPlant
-
-    return PybulletPlant(robot, dt, gui)
