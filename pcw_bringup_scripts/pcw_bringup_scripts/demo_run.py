@@ -37,7 +37,7 @@ from pcw_control import (
     limit_torque,
 )
 from pcw_description import AugmentedObjectModel, RobotDescription, load_robot, odometry, save_robot
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.errors import PcwError
 from pcw_estimation import encoder_slip
 from pcw_sim_bridge.plants.factory import make_plant

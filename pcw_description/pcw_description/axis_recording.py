@@ -26,7 +26,7 @@ import numpy.typing as npt
 import yaml
 
 from .description_fields import load_yaml_mapping, quantity, read_section, section, text
-from .effects.effect_instance import EffectInstance
+from .effect_instance import EffectInstance
 from .effects.registry import read_physics
 from .errors import DescriptionError, PcwError, nearest_name
 from .robot_description import Tolerance

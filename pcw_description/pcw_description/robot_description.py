@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .description_fields import quantity, section, text
-from .effects.effect_instance import EffectInstance
+from .effect_instance import EffectInstance
 from .errors import DescriptionError, KinematicsError, nearest_name
 
 FORMAT = "pcw_robot/1"

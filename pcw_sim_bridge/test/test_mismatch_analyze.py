@@ -13,7 +13,7 @@ import pytest
 from pcw_description import load_robot, parse_robot, ros_messages
 from pcw_description.axis_recording import parse_axis_description
 from pcw_description.description_fields import load_yaml_mapping
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.recording import Recording
 from pcw_description.recording_writer import RecordingWriter
 from pcw_sim_bridge.simulated_run import record_run

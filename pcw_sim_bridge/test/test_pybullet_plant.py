@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import PlantError

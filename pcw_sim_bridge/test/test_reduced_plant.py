@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pcw_description import AugmentedObjectModel, load_robot, parse_robot, shipped_robots
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 from pcw_description.robot_file import robot_to_mapping
 from pcw_sim_bridge.plants.factory import make_plant

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pcw_description import RobotDescription, load_robot
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.whitened_regression import Instance

@@ -9,9 +9,9 @@ import pkgutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..effect_instance import EffectInstance
 from ..errors import DescriptionError, nearest_name
 from .effect import Effect
-from .effect_instance import EffectInstance
 
 ENTRY_POINT_GROUP = "pcw_description.effects"
 _NOT_EFFECTS = ("effect", "registry")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 
 from .evidence_selection import LadderStep, SelectionSettings

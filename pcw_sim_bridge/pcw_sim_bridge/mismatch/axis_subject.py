@@ -15,8 +15,8 @@ from pcw_description.axis_recording import (
     load_axis_description,
     read_axis_recording,
 )
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.effect import JointTorqueEffect
-from pcw_description.effects.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 
 from .axis_channels import AxisProblemBuilder, axis_motion

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
 from pcw_description.robot_description import STEER, RobotDescription

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from pcw_description.effects.effect_instance import EffectInstance
+from pcw_description.effect_instance import EffectInstance
 
 from .findings import InputFinding
 from .regression_problem import RegressionProblem
