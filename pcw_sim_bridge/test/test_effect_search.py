@@ -8,6 +8,7 @@ import pytest
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
 from pcw_sim_bridge.mismatch.bench_cases import BenchCase, draw_bench_case
 from pcw_sim_bridge.mismatch.explanation import Explanation, explain
+from pcw_sim_bridge.mismatch.open_set import smooth_basis
 
 # The main parameter of each effect and how far from the truth it may come out. An error of the torque constant hides behind
 # the tolerance of the inertia (2 % of the inertial force here), hence its width.
@@ -44,6 +45,14 @@ def test_an_effect_alone_is_named_with_its_size(effect, motion):
     estimate = explanation.named[0].estimates[name]
     assert estimate.value == pytest.approx(case.truth[0].parameters[name], rel=tolerance)
     assert estimate.low <= estimate.value <= estimate.high
+
+
+def test_a_variable_that_leaps_leaves_nothing_to_fit_between():
+    """A wheel that only ever ran at two speeds has knots with no sample near them."""
+    speeds = np.repeat([-1.0, 1.0], 500) + 0.01 * np.random.default_rng(0).standard_normal(1000)
+    functions, knots = smooth_basis(speeds, periodic=False)
+    assert functions.shape[1] < len(knots)
+    assert (functions.std(axis=0) > 0.0).all()
 
 
 @pytest.mark.parametrize(

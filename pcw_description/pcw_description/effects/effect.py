@@ -54,6 +54,8 @@ class Effect:
         sensors: topics that see the effect.
         look_alikes: names of effects that it is easily mistaken for.
         separating_experiment: what tells it from its look-alikes.
+        log_prior: how much rarer than the common effects it is on real robots, as a natural logarithm; decides where a
+            recording does not.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Effect:
     sensors: tuple[str, ...]
     look_alikes: tuple[str, ...] = ()
     separating_experiment: str = ""
+    log_prior: float = 0.0
 
     def parameter(self, name: str) -> EffectParameter:
         """Return a parameter by its name."""

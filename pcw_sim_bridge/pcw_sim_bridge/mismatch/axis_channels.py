@@ -377,6 +377,7 @@ class AxisProblemBuilder:
         )
         return Term(
             effect=effect.name,
+            log_prior=effect.log_prior,
             target=(TARGET,),
             parameters=parameters,
             shapes=tuple(shapes),

@@ -237,6 +237,12 @@ class Findings:
             return ""
         return f" in {', '.join(channel.name for channel in self.channels)} (forces could not be judged)"
 
+    def _doubt(self, effect: EffectFinding) -> str:
+        """What else a named effect may be, as words after its statement."""
+        named = {other.name for other in self.effects if other is not effect}
+        rivals = [f"a part of {name}" if name in named else name for name in effect.ambiguous_with]
+        return f" (It may as well be {' or '.join(rivals)}.)" if rivals else ""
+
     def summary(self) -> list[str]:
         """Return five plain lines: subject, verdict, effects, held-out fit, warnings."""
         verdict = {
@@ -246,7 +252,7 @@ class Findings:
             "unexplained": "not explained by any effect of the library",
             "insufficient_data": "not enough data to judge",
         }[self.verdict]
-        found = " ".join(effect.statement for effect in self.effects) or "none"
+        found = " ".join(effect.statement + self._doubt(effect) for effect in self.effects) or "none"
         for leftover in self.unknown:
             found += f" Unknown: {leftover.channel} depends on {', '.join(leftover.depends_on)}."
         if self.fit is None:

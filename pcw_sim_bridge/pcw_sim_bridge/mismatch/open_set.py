@@ -76,7 +76,8 @@ def smooth_basis(values: FloatArray, periodic: bool) -> tuple[FloatArray, FloatA
     knots = 0.5 * (quantiles + even)
     clipped = np.clip(values, knots[0], knots[-1])
     hats = np.stack([np.interp(clipped, knots, row) for row in np.eye(HAT_KNOTS)], axis=1)
-    return hats - hats.mean(axis=0), knots
+    # Between two knots that no sample is near there is nothing to fit.
+    return (hats - hats.mean(axis=0))[:, hats.std(axis=0) > 1e-6], knots
 
 
 class OpenSetTest:

@@ -83,6 +83,7 @@ class Term:
         resolution: spacing of `shapes` per shaping parameter; local search stays within it.
         scan: cheaper, slightly inexact columns of all `shapes` at once, (T, C, len(shapes), len(parameters)), where the
             grid is long; None uses `columns`.
+        log_prior: of the effect (see there), part of every evidence.
     """
 
     effect: str
@@ -94,6 +95,7 @@ class Term:
     repeatable: bool = False
     resolution: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
     scan: Callable[[], FloatArray] | None = None
+    log_prior: float = 0.0
 
     @property
     def key(self) -> str:

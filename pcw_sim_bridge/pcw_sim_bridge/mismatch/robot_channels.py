@@ -434,6 +434,7 @@ class RobotProblemBuilder:
             )
         return Term(
             effect=effect.name,
+            log_prior=effect.log_prior,
             target=target,
             parameters=tuple(parameters),
             shapes=shapes,
@@ -470,6 +471,7 @@ class RobotProblemBuilder:
 
         return Term(
             effect=effect.name,
+            log_prior=effect.log_prior,
             target=(effect.target_kind,),
             shapes=shapes,
             columns=columns,

@@ -165,7 +165,8 @@ class WhitenedRegression:
         deviations = self.deviations(instances)
         mean, inverse, log_determinant, rss = _solve(gram, deviations)
         occam = sum(instance.occam for instance in instances)
-        log_evidence = -0.5 * log_determinant - 0.5 * rss - occam
+        prior = sum(self.problem.terms[instance.term].log_prior for instance in instances)
+        log_evidence = -0.5 * log_determinant - 0.5 * rss - occam + prior
         scale = rss / self.effective_rows
         return Fit(tuple(instances), mean, inverse, float(log_evidence), float(scale), self.rows)
 
@@ -251,7 +252,7 @@ class WhitenedRegression:
             mean = np.linalg.solve(schur, moment)
             explained = np.einsum("spn,spn->sn", moment, mean)
             log_determinant = np.linalg.slogdet(schur)[1] + 2.0 * np.sum(np.log(prior))
-            gain = 0.5 * explained - 0.5 * log_determinant[:, None]
+            gain = 0.5 * explained - 0.5 * log_determinant[:, None] + term.log_prior
             lower = np.array([term.parameters[i].lower for i in term.base_indices()])
             upper = np.array([term.parameters[i].upper for i in term.base_indices()])
             allowed = np.all((mean >= lower[:, None]) & (mean <= upper[:, None]), axis=1)
