@@ -41,6 +41,7 @@ setup(
             "benchmark = pcw_bringup_scripts.benchmark:main",
             "compose = pcw_bringup_scripts.compose:main",
             "demo_run = pcw_bringup_scripts.demo_run:main",
+            "manoeuvre = pcw_bringup_scripts.nodes.manoeuvre:main",
         ],
     },
 )
