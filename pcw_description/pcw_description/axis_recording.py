@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from .description_fields import load_yaml_mapping, quantity, read_section, section, text
 from .effect_instance import EffectInstance
@@ -242,13 +241,6 @@ def axis_to_mapping(axis: AxisDescription) -> dict[str, Any]:
         data["tolerances"] = {name: str(tolerance) for name, tolerance in axis.tolerances.items()}
     data["physics"] = [effect.to_mapping() for effect in axis.physics]
     return data
-
-
-def save_axis_description(axis: AxisDescription, path: str | Path) -> None:
-    """Write an axis description that `load_axis_description` reads back."""
-    Path(path).write_text(
-        yaml.safe_dump(axis_to_mapping(axis), sort_keys=False, allow_unicode=True), encoding="utf-8"
-    )
 
 
 def _read_columns(data: object, kind: str) -> dict[str, Column]:

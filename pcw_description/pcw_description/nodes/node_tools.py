@@ -94,15 +94,6 @@ def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | Non
     return exit_code
 
 
-def spin_until_shutdown(*nodes: Node) -> None:
-    """Spin until SIGINT or SIGTERM arrives, or until the context is shut down by somebody else.
-
-    A signal more than a second after the first raises KeyboardInterrupt, for a callback that never ends.
-    """
-    with _stop_requests() as stop_requests:
-        _spin(nodes, stop_requests)
-
-
 def _spin(nodes: Sequence[Node], stop_requests: list[float]) -> None:
     executor = make_executor()
     try:

@@ -13,7 +13,7 @@ problem; the engine knows nothing of axes and robots.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -192,9 +192,3 @@ def contiguous_blocks(segment: IntArray, count: int) -> IntArray:
         block[piece] = next_block + (np.arange(size) * parts) // size
         next_block += parts
     return block
-
-
-def concatenate_variables(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
-    """Join the variables of several segments; only those that all of them have."""
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
