@@ -16,6 +16,7 @@ from pcw_description.description_fields import load_yaml_mapping
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.recording import Recording
 from pcw_description.recording_writer import RecordingWriter
+from pcw_description.robot_description import DRIVE
 from pcw_sim_bridge.simulated_run import record_run
 
 LINEAR_AXIS = """\
@@ -146,7 +147,9 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
     assert [(effect["name"], effect["target"]) for effect in report["effects"]] == [
         ("drive_coulomb_friction", [caster])
     ]
-    assert report["effects"][0]["parameters"]["coulomb"]["value"] == pytest.approx(coulomb, rel=0.05)
+    found = report["effects"][0]["parameters"]["coulomb"]
+    assert found["value"] == pytest.approx(coulomb, rel=0.03)
+    assert found["ci95"][0] < coulomb < found["ci95"][1]
     assert report["effects"][0]["probability"] > 0.99
     fit = report["fit"]["holdout"]
     assert fit["gap_closed"] > 0.8
@@ -158,6 +161,29 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
     assert lines[0] == str(out / "report.html")
     assert len(lines) == 6
     assert caster in done.stdout
+
+
+@pytest.mark.parametrize("name", ["flow_base", "xr4000", "dyros_pcv", "tidybot2"])
+def test_intervals_hold_the_truth_on_other_robots(name: str, tmp_path: Path) -> None:
+    """Other sizes, offsets and gear couplings; the friction is 4 % of what the drive can give."""
+    nominal = load_robot(name)
+    coulomb = 0.04 * float(nominal.torque_limit[1, DRIVE])
+    friction = EffectInstance(
+        "drive_coulomb_friction",
+        (nominal.caster_names[1],),
+        {"coulomb": coulomb, "asymmetry": 0.0, "smoothing_speed": 0.05},
+    )
+    true_robot = dataclasses.replace(nominal, physics=(friction,))
+    record_run(true_robot, wandering, 25.0, 3, tmp_path / "run", "pybullet", controlled_as=nominal)
+    done = analyze(tmp_path / "run", "--robot", name, "--out", tmp_path / "report", "--quiet")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    [effect] = report["effects"]
+    assert (effect["name"], effect["target"]) == ("drive_coulomb_friction", [nominal.caster_names[1]])
+    low, high = effect["parameters"]["coulomb"]["ci95"]
+    print(f"{name}: {coulomb:.4f} N m, found {effect['parameters']['coulomb']['value']:.4f} ({low:.4f} to {high:.4f})")
+    assert low < coulomb < high
+    assert high - low < 0.5 * coulomb
 
 
 def test_a_healthy_robot_has_nothing_missing(tmp_path: Path) -> None:

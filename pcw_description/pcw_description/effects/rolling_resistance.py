@@ -28,5 +28,7 @@ EFFECT = JointTorqueEffect(
     separating_experiment=(
         "load the wheels unevenly (shift a payload): rolling resistance follows the load, drive friction does not"
     ),
+    # Tyres of one set roll alike: one that alone resists is rarer than a drive with friction.
+    log_prior=-0.5,
     torque=rolling_resistance_torque,
 )

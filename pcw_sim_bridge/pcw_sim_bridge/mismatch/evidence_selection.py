@@ -433,6 +433,8 @@ class EffectSearch:
             retunings.append(retuning)
         total = np.sqrt(np.sum(np.square(own), axis=0))
         floor = np.maximum(self.settings.smallest_share * remains, self.settings.smallest_part * total)
+        # The model itself misjudges the measured side by so much; three deviations of that are no effect.
+        floor = np.maximum(floor, 3.0 * self.problem.scale_deviation * self._sizes(self.problem.measured))
         shares = []
         for sizes, retuning in zip(net, retunings, strict=True):
             share = float(np.max(sizes / np.maximum(floor, 1e-300)))

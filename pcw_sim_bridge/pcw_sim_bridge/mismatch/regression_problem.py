@@ -119,8 +119,8 @@ class RegressionProblem:
         measured: the measured side of each channel (T, C), for error ratios; residual = measured - predicted.
         valid: samples that may be judged (T, C).
         variables: what a leftover may depend on: name -> (T,).
-        scale_deviation: relative deviation of the measured side's scale that no nuisance holds; what an effect measures
-            against it is known no better.
+        scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
+            known no better, and an effect that is no larger is not told from it.
     """
 
     channels: tuple[Channel, ...]
