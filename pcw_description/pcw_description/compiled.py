@@ -22,8 +22,10 @@ try:
 
     NUMBA_AVAILABLE = True
     warnings.filterwarnings("ignore", category=NumbaExperimentalFeatureWarning)
+    # False where NUMBA_DISABLE_JIT is set, to debug: kernels are then plain Python too.
+    COMPILES = not numba.config.DISABLE_JIT
 except ImportError:  # pragma: no cover - exercised on machines without numba
-    NUMBA_AVAILABLE = False
+    NUMBA_AVAILABLE = COMPILES = False
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -31,6 +33,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # normal_force [N], parameters) -> torque [N m]. One signature lets a compiled plant call any list of effects
 # through function pointers, so that adding an effect does not compile the plant again.
 JOINT_TORQUE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
+# Signature of every other kernel: (at, parameters, result), what they hold being a matter of the effect's kind. One
+# signature for all, because each further list of kernels costs a plant's step more than its arithmetic.
+ARRAY_SIGNATURE = "void(float64[::1], float64[::1], float64[::1])"
 
 
 def compiled(function: Function) -> Function:
@@ -44,11 +49,20 @@ def compiled(function: Function) -> Function:
 
 def compiled_joint_torque(function: Function) -> Function:
     """Compile a joint-torque kernel with the common signature `JOINT_TORQUE_SIGNATURE`."""
+    return _compiled_as(JOINT_TORQUE_SIGNATURE, function)
+
+
+def compiled_array_kernel(function: Function) -> Function:
+    """Compile a kernel of arrays with the common signature `ARRAY_SIGNATURE`."""
+    return _compiled_as(ARRAY_SIGNATURE, function)
+
+
+def _compiled_as(signature: str, function: Function) -> Function:
     if not NUMBA_AVAILABLE:
         return function
     dispatcher: Any = compiled(function)
     if dispatcher is not function:  # the same where NUMBA_DISABLE_JIT is set, to debug
-        dispatcher.compile(JOINT_TORQUE_SIGNATURE)
+        dispatcher.compile(signature)
         dispatcher.disable_compile()
     return dispatcher  # type: ignore[no-any-return]
 
@@ -76,12 +90,19 @@ def _kernels_digest(folder: str) -> str:
 
 def joint_torque_list(functions: Sequence[Callable[..., float]]) -> Any:
     """A list of joint-torque kernels that compiled code can call, empty lists included."""
+    return _kernel_list(JOINT_TORQUE_SIGNATURE, functions)
+
+
+def array_kernel_list(functions: Sequence[Callable[..., None]]) -> Any:
+    """A list of kernels of arrays that compiled code can call, empty lists included."""
+    return _kernel_list(ARRAY_SIGNATURE, functions)
+
+
+def _kernel_list(signature: str, functions: Sequence[Callable[..., Any]]) -> Any:
     if not NUMBA_AVAILABLE:
         return list(functions)
-    kernel_type = numba.types.FunctionType(
-        numba.types.float64(*[numba.types.float64] * 4, numba.types.float64[::1])
-    )
-    typed_list = numba.typed.List.empty_list(kernel_type)
+    arguments, result = numba.core.sigutils.normalize_signature(signature)
+    typed_list = numba.typed.List.empty_list(numba.types.FunctionType(result(*arguments)))
     for function in functions:
         typed_list.append(function)
     return typed_list

@@ -15,12 +15,15 @@ class EffectInstance:
         name: name of the effect in the vocabulary.
         target: caster names, or ("chassis",), ("imu",), ("clock",).
         parameters: values by name, defaults filled in.
+        axis: "drive" or "steer" for an effect that can stand at either joint; None for the effect's own place.
     """
 
     name: str
     target: tuple[str, ...]
     parameters: Mapping[str, float]
+    axis: str | None = None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry as it stands under `physics:`."""
-        return {"name": self.name, "target": list(self.target), **dict(self.parameters)}
+        place = {} if self.axis is None else {"axis": self.axis}
+        return {"name": self.name, "target": list(self.target), **place, **dict(self.parameters)}

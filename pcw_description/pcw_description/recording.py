@@ -47,7 +47,7 @@ from .recording_files import RawMessage, RecordingFiles, RecordingWarning, Warni
 from .recording_joints import read_joint_series
 from .recording_series import ImuSeries, JointSeries, JointTrace, OdometrySeries, TwistSeries, WrenchSeries
 from .recording_table import FloatArray, IntArray, MessageTable, RowArray
-from .robot_description import RobotDescription
+from .robot_description import GRAVITY, RobotDescription
 from .ros_messages import IMU, JOINT_STATE, ODOMETRY, TWIST, TWIST_STAMPED, WRENCH_STAMPED
 
 __all__ = [
@@ -77,7 +77,6 @@ _CONTACT = re.compile(r"^contact/([^/]+)/wrench$")
 _KEPT_TYPES = frozenset(name for names in CONTRACT_TOPICS.values() for name in names) | {WRENCH_STAMPED}
 # No such robot turns faster [rad/s].
 FASTEST_GYRO = 35.0
-GRAVITY = 9.81
 
 
 @dataclass

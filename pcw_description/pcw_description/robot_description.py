@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,10 @@ CONTACT_MODELS = ("kiencke", "magic_formula", "dugoff", "burckhardt", "lugre")
 MINIMUM_AXIS_DISTANCE = 0.01
 # Below this offset steering cannot push the wheel sideways with a usable torque.
 MINIMUM_CASTER_OFFSET = 1e-3
+# A wheel sinks in by so much under its share of the weight [m], with this damping ratio, where `suspension` says nothing else.
+STATIC_DEFLECTION = 1.5e-3
+SUSPENSION_DAMPING_RATIO = 0.4
+GRAVITY = 9.81  # [m/s^2]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -126,26 +130,6 @@ class Limits:
 
 
 @dataclasses.dataclass(frozen=True)
-class Caster:
-    """One powered caster wheel."""
-
-    name: str = text("name of the caster; its joints are NAME_steer and NAME_drive")
-    steer_axis: tuple[float, float] = quantity(
-        "m", "steering axis in base_link", length=2, minimum=-10.0, maximum=10.0, hint="a larger value may be in mm"
-    )
-    caster_offset: tuple[float, float] = quantity(
-        "m", "steering axis to wheel centre in the wheel frame (b_x, b_y); a trailing wheel has b_x < 0", length=2,
-        minimum=-1.0, maximum=1.0, hint="a larger value may be in mm",
-    )
-    wheel_radius: float = quantity("m", "rolling radius", above=0.0, maximum=1.0, hint="a larger value may be in mm")
-    module: Module = section("fork and wheel, turning about the steering axis")
-    wheel: Wheel = section("the rolling part")
-    gears: Gears = section("gear ratios and coupling")
-    rotors: Rotors = section("rotor inertias")
-    limits: Limits = section("limits of torque and speed")
-
-
-@dataclasses.dataclass(frozen=True)
 class LateralContact:
     """Friction across the rolling direction."""
 
@@ -167,6 +151,35 @@ class ContactDescription:
         default=0.0,
     )
     shape: dict[str, float] = section("further numbers of the friction curve, by name", default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Suspension:
+    """What carries the load of one wheel: its spring and the tyre together, vertical."""
+
+    stiffness: float = quantity("N/m", "vertical stiffness of one wheel", above=0.0, maximum=1e8)
+    damping: float = quantity("N s/m", "vertical damping of one wheel", minimum=0.0, maximum=1e6)
+
+
+@dataclasses.dataclass(frozen=True)
+class Caster:
+    """One powered caster wheel."""
+
+    name: str = text("name of the caster; its joints are NAME_steer and NAME_drive")
+    steer_axis: tuple[float, float] = quantity(
+        "m", "steering axis in base_link", length=2, minimum=-10.0, maximum=10.0, hint="a larger value may be in mm"
+    )
+    caster_offset: tuple[float, float] = quantity(
+        "m", "steering axis to wheel centre in the wheel frame (b_x, b_y); a trailing wheel has b_x < 0", length=2,
+        minimum=-1.0, maximum=1.0, hint="a larger value may be in mm",
+    )
+    wheel_radius: float = quantity("m", "rolling radius", above=0.0, maximum=1.0, hint="a larger value may be in mm")
+    module: Module = section("fork and wheel, turning about the steering axis")
+    wheel: Wheel = section("the rolling part")
+    gears: Gears = section("gear ratios and coupling")
+    rotors: Rotors = section("rotor inertias")
+    limits: Limits = section("limits of torque and speed")
+    contact: ContactDescription | None = section("this wheel's own tyre; default: the robot's `contact`", default=None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,6 +272,9 @@ class RobotDescription:
     casters: tuple[Caster, ...] = section("the casters, in the order used by every array")
     contact: ContactDescription = section("the nominal ground")
     sensors: Sensors = section("what the robot measures")
+    suspension: Suspension | None = section(
+        "what carries the load of one wheel; default: 1.5 mm of static deflection, damped with a ratio of 0.4", default=None
+    )
     tolerances: dict[str, Tolerance] = section("how far a healthy robot may differ", default_factory=dict)
     physics: tuple[EffectInstance, ...] = section("effects beyond the nominal model; empty in a nominal robot", default=())
 
@@ -335,6 +351,38 @@ class RobotDescription:
     def total_mass(self) -> float:
         """Mass of the whole robot [kg]."""
         return self.chassis.mass + sum(caster.module.mass for caster in self.casters)
+
+    @cached_property
+    def tyres(self) -> tuple[ContactDescription, ...]:
+        """The tyre of each caster on the nominal ground, (n,)."""
+        return tuple(caster.contact or self.contact for caster in self.casters)
+
+    @cached_property
+    def wheel_suspension(self) -> Suspension:
+        """What carries the load of one wheel, defaults filled in."""
+        if self.suspension is not None:
+            return self.suspension
+        share = self.total_mass / self.n
+        stiffness = share * GRAVITY / STATIC_DEFLECTION
+        return Suspension(stiffness, 2.0 * SUSPENSION_DAMPING_RATIO * math.sqrt(stiffness * share))
+
+    def with_casters(self, names: Sequence[str], change: Callable[[Caster], Caster]) -> RobotDescription:
+        """Return the robot with the named casters changed, validated anew.
+
+        Raises:
+            DescriptionError: unknown name, or a change that no robot can have.
+        """
+        indices = {self.caster_index(name) for name in names}
+        casters = [change(caster) if i in indices else caster for i, caster in enumerate(self.casters)]
+        return dataclasses.replace(self, casters=tuple(casters))
+
+    def with_tyres(
+        self, names: Sequence[str], change: Callable[[ContactDescription], ContactDescription]
+    ) -> RobotDescription:
+        """Return the robot with the tyres of the named casters changed."""
+        return self.with_casters(
+            names, lambda caster: dataclasses.replace(caster, contact=change(caster.contact or self.contact))
+        )
 
     def tolerance(self, name: str) -> Tolerance:
         """Return the tolerance of this file, or the documented default."""

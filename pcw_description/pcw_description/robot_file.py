@@ -78,13 +78,20 @@ def parse_robot(data: Mapping[str, Any]) -> RobotDescription:
     content["tolerances"] = {} if tolerances is None else read_tolerances(tolerances, DEFAULT_TOLERANCES)
     names = [caster.name for caster in content["casters"]]
     content["physics"] = () if physics is None else read_physics(physics, names)
-    contact = content.get("contact")
+    _check_shape(content, "")
+    for index, item in enumerate(casters):
+        _check_shape({**defaults, **item}, f"casters[{index}].")
+    robot: RobotDescription = read_section(RobotDescription, content, "")
+    for tyre in (robot.contact, *robot.tyres):
+        tyre_parameters(tyre)  # only the friction curve knows the names of its shape numbers
+    return robot
+
+
+def _check_shape(owner: Mapping[str, Any], where: str) -> None:
+    contact = owner.get("contact")
     shape = contact.get("shape") if isinstance(contact, Mapping) else None
     if shape is not None and not (isinstance(shape, Mapping) and all(_is_number(value) for value in shape.values())):
-        raise DescriptionError("contact.shape", shape, "allowed: a mapping of names to finite numbers")
-    robot: RobotDescription = read_section(RobotDescription, content, "")
-    tyre_parameters(robot.contact)  # only the friction curve knows the names of its shape numbers
-    return robot
+        raise DescriptionError(f"{where}contact.shape", shape, "allowed: a mapping of names to finite numbers")
 
 
 def _is_number(value: object) -> bool:
@@ -154,6 +161,8 @@ def robot_to_mapping(robot: RobotDescription) -> dict[str, Any]:
         "contact": _plain(robot.contact),
         "sensors": _plain(robot.sensors),
     }
+    if robot.suspension is not None:
+        data["suspension"] = _plain(robot.suspension)
     if robot.tolerances:
         data["tolerances"] = {name: str(tolerance) for name, tolerance in robot.tolerances.items()}
     data["physics"] = [effect.to_mapping() for effect in robot.physics]

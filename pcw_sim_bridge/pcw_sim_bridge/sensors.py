@@ -5,7 +5,9 @@ counts per turn of the motor: with a steer/drive coupling the resolution of one 
 
 The accelerometer stands at r in base_link and measures what is not gravity,
 
-    a = a_0 + alpha x r + omega x (omega x r) + g z.
+    a = a_0 + alpha x r + omega x (omega x r) - g.
+
+Effects of the robot's `physics` that falsify a reading act here, between the truth and the noise.
 
 Rates are the caller's business: each function is called when its sensor is due. All noise comes from the `rng` given.
 """
@@ -14,15 +16,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
+from pcw_description.effects.kinds import EncoderEffect, ImuEffect
+from pcw_description.effects.registry import get
 from pcw_description.errors import DescriptionError
-from pcw_description.robot_description import FloatArray, ImuDescription, RobotDescription, TrackerDescription
+from pcw_description.robot_description import AXIS_NAMES, FloatArray, RobotDescription, TrackerDescription
 
 from .plants.plant import PlantState
 
-STANDARD_GRAVITY = 9.81  # [m/s^2], as in the plants
 VELOCITY_SOURCES = ("drive", "difference")
 
 
@@ -72,6 +76,13 @@ class Encoders:
         self._gear_inverse = np.linalg.inv(robot.gear_matrix)
         self._counts_per_radian = np.array([self._sensor.drive_counts, self._sensor.steer_counts]) / math.tau
         self._difference = velocity_source == "difference"
+        self._effects: list[tuple[EncoderEffect, list[int], int, Mapping[str, float]]] = []
+        for instance in robot.physics:
+            effect = get(instance.name)
+            if isinstance(effect, EncoderEffect):
+                casters = [robot.caster_index(name) for name in instance.target]
+                axis = AXIS_NAMES.index(instance.axis or effect.axis)
+                self._effects.append((effect, casters, axis, instance.parameters))
 
     def counts(self, joint_position: FloatArray) -> FloatArray:
         """Return the whole counts (n, 2) of the motors' encoders for joint angles (n, 2) [rad]."""
@@ -94,13 +105,16 @@ class Encoders:
             rng: source of the noise.
         """
         sensor, shape = self._sensor, truth.joint_position.shape
-        position = self.position(self.counts(truth.joint_position))
-        if not self._difference:
-            velocity = truth.joint_velocity
-        elif previous is None:
-            velocity = np.zeros(shape)
-        else:
-            velocity = (position - previous.position) / dt
+        seen, velocity = truth.motor_position, truth.motor_velocity
+        if self._effects:
+            seen, velocity = seen.copy(), velocity.copy()
+            for effect, casters, axis, parameters in self._effects:
+                seen[casters, axis], velocity[casters, axis] = effect.measure(
+                    seen[casters, axis], velocity[casters, axis], parameters
+                )
+        position = self.position(self.counts(seen))
+        if self._difference:
+            velocity = np.zeros(shape) if previous is None else (position - previous.position) / dt
         return JointReading(
             position=position,
             velocity=velocity + sensor.velocity_noise * rng.standard_normal(shape),
@@ -108,17 +122,37 @@ class Encoders:
         )
 
 
-def read_imu(imu: ImuDescription, truth: PlantState, rng: np.random.Generator) -> ImuReading:
-    """Return one reading of the IMU; the plants are planar in what they report, so roll and pitch are zero."""
-    r_x, r_y, _ = imu.position
-    a_x, a_y, alpha = truth.acceleration
-    omega = truth.twist[2]
-    # a_0 + alpha x r + omega x (omega x r), written out: np.cross is slow on single vectors.
-    acceleration = np.array([a_x - alpha * r_y - omega**2 * r_x, a_y + alpha * r_x - omega**2 * r_y, STANDARD_GRAVITY])
-    return ImuReading(
-        angular_velocity=np.array([0.0, 0.0, omega]) + imu.gyro_noise * rng.standard_normal(3),
-        linear_acceleration=acceleration + imu.accelerometer_noise * rng.standard_normal(3),
-    )
+class Imu:
+    """The IMU of a robot, axes parallel to base_link.
+
+    Args:
+        robot: the robot as it really is; its `physics` hold the IMU's errors.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        assert robot.sensors.imu is not None
+        self._sensor = robot.sensors.imu
+        self._effects = [
+            (effect, instance.parameters)
+            for instance in robot.physics
+            if isinstance(effect := get(instance.name), ImuEffect)
+        ]
+
+    def read(self, truth: PlantState, rng: np.random.Generator) -> ImuReading:
+        """Return one reading; the plants are planar in what they report, so roll and pitch are zero."""
+        imu = self._sensor
+        r_x, r_y, _ = imu.position
+        a_x, a_y, alpha = truth.acceleration
+        omega = truth.twist[2]
+        # a_0 + alpha x r + omega x (omega x r), written out: np.cross is slow on single vectors.
+        acceleration = np.array([a_x - alpha * r_y - omega**2 * r_x, a_y + alpha * r_x - omega**2 * r_y, 0.0]) - truth.gravity
+        rate = np.array([0.0, 0.0, omega])
+        for effect, parameters in self._effects:
+            rate, acceleration = effect.measure(rate, acceleration, parameters)
+        return ImuReading(
+            angular_velocity=rate + imu.gyro_noise * rng.standard_normal(3),
+            linear_acceleration=acceleration + imu.accelerometer_noise * rng.standard_normal(3),
+        )
 
 
 def read_tracker(tracker: TrackerDescription, truth: PlantState, rng: np.random.Generator) -> FloatArray:

@@ -15,7 +15,8 @@ import numpy as np
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 
 from .plants.plant import Plant, PlantError, PlantState
-from .sensors import Encoders, ImuReading, JointReading, read_imu, read_tracker
+from .plants.true_robot import as_it_really_is
+from .sensors import Encoders, Imu, ImuReading, JointReading, read_tracker
 
 NANOSECONDS = 1_000_000_000
 DEFAULT_TRUTH_RATE = 100.0  # [Hz], of a robot file without a tracker
@@ -125,11 +126,12 @@ class SimulatedRobot:
         self._seed = seed
         self._step_ns = round(plant.dt * NANOSECONDS)
         self._encoders = Encoders(robot, velocity_source)
+        self._imu = Imu(as_it_really_is(robot)) if sensors.imu else None
         self._loops = VelocityLoops(robot, velocity_bandwidth)
         self._control = _Schedule("sensors.encoders.rate", sensors.encoders.rate, plant.dt)
         truth_rate = sensors.tracker.rate if sensors.tracker else DEFAULT_TRUTH_RATE
         self._truth = _Schedule("sensors.tracker.rate", truth_rate, plant.dt)
-        self._imu = _Schedule("sensors.imu.rate", sensors.imu.rate, plant.dt) if sensors.imu else None
+        self._imu_times = _Schedule("sensors.imu.rate", sensors.imu.rate, plant.dt) if sensors.imu else None
         self._begin()
 
     def _begin(self) -> None:
@@ -144,7 +146,7 @@ class SimulatedRobot:
             schedule.restart()
 
     def _schedules(self) -> list[_Schedule]:
-        return [schedule for schedule in (self._control, self._truth, self._imu) if schedule is not None]
+        return [schedule for schedule in (self._control, self._truth, self._imu_times) if schedule is not None]
 
     @property
     def time_ns(self) -> int:
@@ -183,13 +185,13 @@ class SimulatedRobot:
         truth = self.plant.state()
         if not (np.isfinite(truth.twist).all() and np.isfinite(truth.joint_velocity).all()):
             raise PlantError(f"the plant's state is not finite at {truth.time:.3f} s")
-        tracker, imu = self.robot.sensors.tracker, self.robot.sensors.imu
+        tracker = self.robot.sensors.tracker
         if self._truth in due:
             pose = read_tracker(tracker, truth, self._rng) if tracker else truth.pose
             yield Sample(self.time_ns, TrackedPose(pose, truth))
             yield Sample(self.time_ns, truth)
-        if imu is not None and self._imu in due:
-            yield Sample(self.time_ns, read_imu(imu, truth, self._rng))
+        if self._imu is not None and self._imu_times in due:
+            yield Sample(self.time_ns, self._imu.read(truth, self._rng))
         if self._control in due:
             dt = (self.time_ns - self._joints_ns) / NANOSECONDS
             self._joints = self._encoders.read(truth, self._joints, dt, self._rng)
@@ -222,7 +224,7 @@ class SimulatedRobot:
         if command.effort is not None:
             return command.effort
         assert command.velocity is not None
-        return self._loops.torque(command.velocity, self.plant.state().joint_velocity, self.control_period)
+        return self._loops.torque(command.velocity, self.plant.state().motor_velocity, self.control_period)
 
     def close(self) -> None:
         """Free what the plant holds."""

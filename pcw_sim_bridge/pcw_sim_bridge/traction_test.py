@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
+from pcw_description.robot_description import DRIVE, GRAVITY, STEER, FloatArray, RobotDescription
 from pcw_description.wheel_dynamics import slip_ratio
 
 from .plants.plant import Plant, PlantError
@@ -37,7 +37,7 @@ def traction_rig(robot: RobotDescription) -> RobotDescription:
     A wheel beside the centre line would turn the robot, and the turning would change the slip to be measured. The rig's
     motors can take every wheel past its friction limit.
     """
-    weight = robot.total_mass * 9.81
+    weight = robot.total_mass * GRAVITY
     strong = 2.0 * robot.contact.mu_p * weight * robot.casters[0].wheel_radius
     module = dataclasses.replace(
         robot.casters[0],

@@ -9,18 +9,26 @@ import pytest
 from pcw_description import load_robot, shipped_robots
 from pcw_description.errors import DescriptionError
 from pcw_sim_bridge.plants.plant import PlantState
-from pcw_sim_bridge.sensors import Encoders, read_imu, read_tracker
+from pcw_sim_bridge.sensors import Encoders, Imu, read_tracker
 
 THESIS = load_robot("thesis")
 
 
-def truth(n=4, **changes):
+def truth(n=4, joint_position=None, joint_velocity=None, **changes):
+    """A robot at rest but for the changes; its gears are rigid."""
+    position = np.zeros((n, 2)) if joint_position is None else joint_position
+    velocity = np.zeros((n, 2)) if joint_velocity is None else joint_velocity
     state = PlantState(
-        time=0.0, pose=np.zeros(3), twist=np.zeros(3), acceleration=np.zeros(3), joint_position=np.zeros((n, 2)),
-        joint_velocity=np.zeros((n, 2)), motor_torque=np.zeros((n, 2)), slip=np.zeros((n, 2)),
-        contact_force=np.zeros((n, 2)), normal_force=np.zeros(n),
+        time=0.0, pose=np.zeros(3), twist=np.zeros(3), acceleration=np.zeros(3), gravity=np.array([0.0, 0.0, -9.81]),
+        joint_position=position, joint_velocity=velocity, motor_position=position, motor_velocity=velocity,
+        motor_torque=np.zeros((n, 2)), slip=np.zeros((n, 2)), contact_force=np.zeros((n, 2)), normal_force=np.zeros(n),
     )
     return dataclasses.replace(state, **changes)
+
+
+def with_imu(**changes):
+    sensors = dataclasses.replace(THESIS.sensors, imu=dataclasses.replace(THESIS.sensors.imu, **changes))
+    return Imu(dataclasses.replace(THESIS, sensors=sensors))
 
 
 def with_encoders(robot, **changes):
@@ -98,11 +106,11 @@ def test_velocity_by_difference_is_that_of_the_counts(rng):
 def test_accelerometer_on_a_circle_reads_the_centripetal_acceleration_of_its_own_place(rng):
     """Base at (R, 0) of a circle of radius R, driving along +x: every point has omega^2 times its way to the centre."""
     radius, omega = 2.0, 0.7
-    imu = dataclasses.replace(THESIS.sensors.imu, position=(0.3, -0.1, 0.2), gyro_noise=0.0, accelerometer_noise=0.0)
+    imu = with_imu(position=(0.3, -0.1, 0.2), gyro_noise=0.0, accelerometer_noise=0.0)
     state = truth(
         twist=np.array([omega * radius, 0.0, omega]), acceleration=np.array([0.0, omega**2 * radius, 0.0])
     )
-    reading = read_imu(imu, state, rng)
+    reading = imu.read(state, rng)
     centre = np.array([0.0, radius])  # of the circle, in base_link
     expected = omega**2 * (centre - np.array([0.3, -0.1]))
     np.testing.assert_allclose(reading.linear_acceleration, [*expected, 9.81], atol=1e-12)
@@ -110,8 +118,8 @@ def test_accelerometer_on_a_circle_reads_the_centripetal_acceleration_of_its_own
 
 
 def test_accelerometer_feels_a_yaw_acceleration_through_its_lever_arm(rng):
-    imu = dataclasses.replace(THESIS.sensors.imu, position=(0.3, -0.1, 0.2), gyro_noise=0.0, accelerometer_noise=0.0)
-    reading = read_imu(imu, truth(acceleration=np.array([0.0, 0.0, 2.0])), rng)
+    imu = with_imu(position=(0.3, -0.1, 0.2), gyro_noise=0.0, accelerometer_noise=0.0)
+    reading = imu.read(truth(acceleration=np.array([0.0, 0.0, 2.0])), rng)
     np.testing.assert_allclose(reading.linear_acceleration, [0.2, 0.6, 9.81], atol=1e-12)
 
 
@@ -121,7 +129,7 @@ def test_equal_seeds_give_equal_readings():
     def everything(seed):
         rng = np.random.default_rng(seed)
         joints = Encoders(THESIS).read(state, None, 0.002, rng)
-        imu = read_imu(THESIS.sensors.imu, state, rng)
+        imu = Imu(THESIS).read(state, rng)
         pose = read_tracker(THESIS.sensors.tracker, state, rng)
         return np.concatenate([joints.velocity.ravel(), joints.effort.ravel(), imu.linear_acceleration, pose])
 

@@ -64,6 +64,20 @@ def _curve(model, slip, mu_p, lambda_p, a, b, c):  # type: ignore[no-untyped-def
 
 
 @compiled
+def _secant_slopes(tyre, longitudinal_slip, lateral_slip):  # type: ignore[no-untyped-def]
+    """Return friction coefficient over slip, longitudinal and lateral [1], of combined steady slip."""
+    model = int(tyre[MODEL])
+    sx, sy = longitudinal_slip / tyre[LAMBDA], lateral_slip / tyre[LATERAL_LAMBDA]
+    s = max(math.sqrt(sx * sx + sy * sy), 1e-9)  # at zero slip the slope of the curve's beginning
+    along = _curve(model, s * tyre[LAMBDA], tyre[MU], tyre[LAMBDA], tyre[A], tyre[B], tyre[C])
+    lateral_mu, lateral_lambda = tyre[LATERAL_MU], tyre[LATERAL_LAMBDA]
+    across = _curve(
+        model, s * lateral_lambda, lateral_mu, lateral_lambda, tyre[LATERAL_A], tyre[LATERAL_B], tyre[LATERAL_C]
+    )
+    return along / (s * tyre[LAMBDA]), across / (s * lateral_lambda)
+
+
+@compiled
 def friction_coefficient(tyre, longitudinal_slip, lateral_slip):  # type: ignore[no-untyped-def]
     """Return the friction coefficients (longitudinal, lateral) [1] of combined steady slip.
 
@@ -72,21 +86,12 @@ def friction_coefficient(tyre, longitudinal_slip, lateral_slip):  # type: ignore
         longitudinal_slip: lambda [1], positive for traction.
         lateral_slip: the same across, eps_y / V [1].
     """
-    model = int(tyre[MODEL])
-    sx, sy = longitudinal_slip / tyre[LAMBDA], lateral_slip / tyre[LATERAL_LAMBDA]
-    s = math.sqrt(sx * sx + sy * sy)
-    if s < 1e-12:
-        return 0.0, 0.0
-    along = _curve(model, s * tyre[LAMBDA], tyre[MU], tyre[LAMBDA], tyre[A], tyre[B], tyre[C])
-    lateral_mu, lateral_lambda = tyre[LATERAL_MU], tyre[LATERAL_LAMBDA]
-    across = _curve(
-        model, s * lateral_lambda, lateral_mu, lateral_lambda, tyre[LATERAL_A], tyre[LATERAL_B], tyre[LATERAL_C]
-    )
-    return along * sx / s, across * sy / s
+    along, across = _secant_slopes(tyre, longitudinal_slip, lateral_slip)
+    return along * longitudinal_slip, across * lateral_slip
 
 
 @compiled
-def tyre_step(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type: ignore[no-untyped-def]
+def tyre_step_with_slopes(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type: ignore[no-untyped-def]
     """Advance one tyre by dt.
 
     Args:
@@ -98,7 +103,9 @@ def tyre_step(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type:
         dt: step [s].
 
     Returns:
-        New z_x, z_y [m] and the force of the ground on the wheel F_x, F_y in the wheel frame [N].
+        New z_x, z_y [m]; the force of the ground on the wheel F_x, F_y in the wheel frame [N]; and what both are more per
+        slip velocity, for plants that take the new one implicitly: dz_x, dz_y [s], dF_x, dF_y [N s/m], all >= 0. The
+        latter are secants of the friction curve, which are positive beyond its peak too.
     """
     length = tyre[LENGTH]
     loss_x = loss_y = speed / length
@@ -107,15 +114,30 @@ def tyre_step(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type:
         loss_x += tyre[A] / length * slip_speed / lugre.sliding_friction(slip_speed, tyre[MU], tyre[B], tyre[C])
         sliding_y = lugre.sliding_friction(slip_speed, tyre[LATERAL_MU], tyre[LATERAL_B], tyre[LATERAL_C])
         loss_y += tyre[LATERAL_A] / length * slip_speed / sliding_y
-    new_x = (z_x + dt * slip_x) / (1.0 + dt * loss_x)
-    new_y = (z_y + dt * slip_y) / (1.0 + dt * loss_y)
+    gain_x, gain_y = dt / (1.0 + dt * loss_x), dt / (1.0 + dt * loss_y)
+    new_x = z_x / (1.0 + dt * loss_x) + gain_x * slip_x
+    new_y = z_y / (1.0 + dt * loss_y) + gain_y * slip_y
     damping = DAMPING_TIME / dt
     lambda_x = (new_x + damping * (new_x - z_x)) / length
     lambda_y = (new_y + damping * (new_y - z_y)) / length
-    if int(tyre[MODEL]) == _LUGRE:
-        return new_x, new_y, tyre[A] * lambda_x * normal_force, tyre[LATERAL_A] * lambda_y * normal_force
-    along, across = friction_coefficient(tyre, lambda_x, lambda_y)
-    return new_x, new_y, along * normal_force, across * normal_force
+    along, across = tyre[A], tyre[LATERAL_A]
+    if int(tyre[MODEL]) != _LUGRE:
+        along, across = _secant_slopes(tyre, lambda_x, lambda_y)
+    along *= normal_force
+    across *= normal_force
+    grip = (1.0 + damping) / length
+    return (
+        new_x, new_y, along * lambda_x, across * lambda_y, gain_x, gain_y, along * grip * gain_x, across * grip * gain_y
+    )
+
+
+@compiled
+def tyre_step(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type: ignore[no-untyped-def]
+    """Advance one tyre by dt; return new z_x, z_y [m], F_x and F_y [N]. See `tyre_step_with_slopes`."""
+    new_x, new_y, force_x, force_y, _, _, _, _ = tyre_step_with_slopes(
+        tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt
+    )
+    return new_x, new_y, force_x, force_y
 
 
 @compiled

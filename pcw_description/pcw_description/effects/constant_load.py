@@ -1,7 +1,8 @@
 """A constant torque on the drive: a cable pulling, an unbalanced weight, an offset of the torque sensor or amplifier."""
 
 from ..compiled import compiled_joint_torque
-from .effect import EffectParameter, JointTorqueEffect
+from .effect import EffectParameter
+from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque

@@ -3,7 +3,8 @@
 import math
 
 from ..compiled import compiled_joint_torque
-from .effect import EffectParameter, JointTorqueEffect
+from .effect import EffectParameter
+from .kinds import JointTorqueEffect
 
 # tanh(v / smoothing_speed) for the sign: at 0.05 rad/s a wheel of 75 mm creeps by 4 mm/s, below what encoders resolve
 # as steady motion, and the plant needs no event handling.

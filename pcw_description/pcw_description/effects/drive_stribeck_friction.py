@@ -4,7 +4,8 @@ import math
 
 from ..compiled import compiled_joint_torque
 from .drive_coulomb_friction import SMOOTHING_SPEED
-from .effect import EffectParameter, JointTorqueEffect
+from .effect import EffectParameter
+from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque

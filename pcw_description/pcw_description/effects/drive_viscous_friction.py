@@ -1,7 +1,8 @@
 """Viscous friction of the drive: a torque proportional to speed, against it."""
 
 from ..compiled import compiled_joint_torque
-from .effect import EffectParameter, JointTorqueEffect
+from .effect import EffectParameter
+from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque

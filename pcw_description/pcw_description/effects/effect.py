@@ -1,22 +1,20 @@
 """What a physical effect is: parameters, contribution, regressor, and how to say it.
 
 An effect is written once. A simulator calls its contribution, the analyser its regressor, the report its statement.
-A third party adds one by a module with a module-level `EFFECT`, in this folder or behind the entry-point group
-`pcw_description.effects`.
+`kinds` has a class for every place of a robot where one can act. A third party adds one by a module with a module-level
+`EFFECT`, in this folder or behind the entry-point group `pcw_description.effects`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..compiled import joint_torque_along, joint_torque_list
 from ..errors import DescriptionError, nearest_name
-from ..robot_description import RobotDescription
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -49,6 +47,7 @@ class Effect:
         name: name in the vocabulary (INTERFACES section 5), also the name of the file.
         target_kind: "caster", "chassis", "imu" or "clock".
         axis: what the report calls the place: "drive", "steer", "chassis", "imu" or "clock".
+        axes: joints that it can stand at instead, by the key `axis` of an entry of `physics`; empty if only at `axis`.
         summary: one sentence on the physics.
         sentence: the statement with `{target}` and parameter names to be filled in.
         sensors: topics that see the effect.
@@ -68,6 +67,7 @@ class Effect:
     look_alikes: tuple[str, ...] = ()
     separating_experiment: str = ""
     log_prior: float = 0.0
+    axes: tuple[str, ...] = ()
 
     def parameter(self, name: str) -> EffectParameter:
         """Return a parameter by its name."""
@@ -110,66 +110,8 @@ class Effect:
             checked[parameter.name] = float(value)
         return checked
 
-    def statement(self, target: Sequence[str], parameters: Mapping[str, float]) -> str:
-        """Return one plain sentence that states the effect with its numbers."""
-        filled = {parameter.name: parameter.default for parameter in self.parameters} | dict(parameters)
-        return self.sentence.format(target=" and ".join(target), **filled)
-
-
-@dataclasses.dataclass(frozen=True)
-class JointTorqueEffect(Effect):
-    """A torque that the effect adds to one joint of each targeted caster.
-
-    Attributes:
-        torque: compiled kernel (position [rad], velocity [rad/s], motor_torque [N m], normal_force [N],
-            parameters (len(self.parameters),)) -> torque [N m]; on a linear bench axis m, m/s and N instead.
-    """
-
-    torque: Callable[..., float] = dataclasses.field(default=lambda *_: 0.0, repr=False)
-
-    def contribution(
-        self,
-        position: FloatArray,
-        velocity: FloatArray,
-        motor_torque: FloatArray,
-        normal_force: FloatArray,
-        parameters: Mapping[str, float],
-    ) -> FloatArray:
-        """Evaluate the kernel along a recording; all arrays (T,), result (T,) [N m]."""
-        q, v, tau, load = (np.ascontiguousarray(a, dtype=float) for a in (position, velocity, motor_torque, normal_force))
-        torque: FloatArray = joint_torque_along(joint_torque_list([self.torque]), q, v, tau, load, self.values(parameters))
-        return torque
-
-    def regressor(
-        self,
-        position: FloatArray,
-        velocity: FloatArray,
-        motor_torque: FloatArray,
-        normal_force: FloatArray,
-        parameters: Mapping[str, float],
-    ) -> dict[str, FloatArray]:
-        """Return d contribution / d parameter for every linear parameter, each (T,).
-
-        Exact because the contribution is linear in them: each column is the kernel at a unit parameter, the other
-        linear ones at zero, the shaping ones as given.
-        """
-        columns = {}
-        for parameter in self.linear_parameters:
-            unit = {other.name: 0.0 for other in self.linear_parameters} | {parameter.name: 1.0}
-            columns[parameter.name] = self.contribution(
-                position, velocity, motor_torque, normal_force, {**parameters, **unit}
-            )
-        return columns
-
-
-@dataclasses.dataclass(frozen=True)
-class DescriptionEffect(Effect):
-    """An effect that is a number of the description being another one than stated.
-
-    Attributes:
-        apply: function (robot, target, parameters dict) -> the robot as it really is.
-    """
-
-    apply: Callable[[RobotDescription, Sequence[str], Mapping[str, float]], RobotDescription] = dataclasses.field(
-        default=lambda robot, *_: robot, repr=False
-    )
+    def statement(self, target: Sequence[str], parameters: Mapping[str, float], axis: str | None = None) -> str:
+        """Return one plain sentence that states the effect with its numbers, at `axis` (default: the effect's own)."""
+        filled: dict[str, Any] = {parameter.name: parameter.default for parameter in self.parameters} | dict(parameters)
+        joint = {"drive": "drive", "steer": "steering"}.get(axis or self.axis, "")
+        return self.sentence.format(target=" and ".join(target), joint=joint, **filled)

@@ -1,10 +1,12 @@
-"""Friction of the drive that grows with the torque it transmits, as in gears."""
+"""Friction of a gear that grows with the torque it transmits, as in gears."""
 
 import math
 
 from ..compiled import compiled_joint_torque
+from ..robot_description import AXIS_NAMES
 from .drive_coulomb_friction import SMOOTHING_SPEED
-from .effect import EffectParameter, JointTorqueEffect
+from .effect import EffectParameter
+from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
@@ -18,7 +20,7 @@ EFFECT = JointTorqueEffect(
     target_kind="caster",
     axis="drive",
     summary="Gear friction: a fraction of the transmitted torque is lost.",
-    sentence="Gear friction of {fraction:.3g} of the transmitted torque in the drive of {target}.",
+    sentence="Gear friction of {fraction:.3g} of the transmitted torque in the {joint} of {target}.",
     parameters=(
         EffectParameter("fraction", "1", "part of the motor torque lost to friction", 0.0, 0.9, 0.1, linear=True),
         SMOOTHING_SPEED,
@@ -27,4 +29,5 @@ EFFECT = JointTorqueEffect(
     look_alikes=("drive_coulomb_friction", "torque_constant_error"),
     separating_experiment="accelerate hard and gently at the same speeds, with and without payload",
     torque=load_friction_torque,
+    axes=AXIS_NAMES,
 )

@@ -1,9 +1,11 @@
-"""Cogging of the drive motor: a torque periodic in the angle of the joint."""
+"""Cogging of a motor: a torque periodic in the angle of the joint."""
 
 import math
 
 from ..compiled import compiled_joint_torque
-from .effect import EffectParameter, JointTorqueEffect
+from ..robot_description import AXIS_NAMES
+from .effect import EffectParameter
+from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
@@ -19,7 +21,7 @@ EFFECT = JointTorqueEffect(
     axis="drive",
     summary="Torque ripple tied to the angle of the motor: magnets pulling on the slots.",
     sentence=(
-        "Cogging of order {order:.4g} per radian with cosine {cosine:.3g} and sine {sine:.3g} N m in the drive of {target}."
+        "Cogging of order {order:.4g} per radian with cosine {cosine:.3g} and sine {sine:.3g} N m in the {joint} of {target}."
     ),
     parameters=(
         EffectParameter("cosine", "N m", "cosine part of the ripple", -1e4, 1e4, 0.2, linear=True),
@@ -30,4 +32,6 @@ EFFECT = JointTorqueEffect(
     look_alikes=("wheel_eccentricity",),
     separating_experiment="turn slowly over many revolutions in both directions, at two speeds",
     torque=cogging_torque,
+    motor_side=True,
+    axes=AXIS_NAMES,
 )

@@ -6,7 +6,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from .effect import DescriptionEffect, EffectParameter
+from .effect import EffectParameter
+from .kinds import DescriptionEffect
 
 if TYPE_CHECKING:
     from ..robot_description import RobotDescription

@@ -14,7 +14,7 @@ from ..errors import DescriptionError, nearest_name
 from .effect import Effect
 
 ENTRY_POINT_GROUP = "pcw_description.effects"
-_NOT_EFFECTS = ("effect", "registry")
+_NOT_EFFECTS = ("effect", "kinds", "registry")
 
 
 @functools.cache
@@ -79,9 +79,19 @@ def read_physics(entries: object, caster_names: Sequence[str]) -> tuple[EffectIn
             raise DescriptionError(f"{where}.name", name, f"unknown effect; {nearest_name(str(name), effects)}")
         effect = effects[name]
         target = _read_target(entry.get("target"), effect, caster_names, where)
-        parameters: dict[str, Any] = {str(k): v for k, v in entry.items() if k not in ("name", "target")}
-        instances.append(EffectInstance(effect.name, target, effect.check(parameters, where)))
+        axis = _read_axis(entry, effect, where)
+        parameters: dict[str, Any] = {str(k): v for k, v in entry.items() if k not in ("name", "target", "axis")}
+        instances.append(EffectInstance(effect.name, target, effect.check(parameters, where), axis))
     return tuple(instances)
+
+
+def _read_axis(entry: Mapping[str, Any], effect: Effect, where: str) -> str | None:
+    if "axis" not in entry:
+        return None
+    if entry["axis"] not in effect.axes:
+        places = ", ".join(effect.axes) if effect.axes else f"no axis for {effect.name}, which acts at the {effect.axis}"
+        raise DescriptionError(f"{where}.axis", entry["axis"], f"allowed: {places}")
+    return str(entry["axis"])
 
 
 def _read_target(target: object, effect: Effect, caster_names: Sequence[str], where: str) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Coulomb friction of the steering: a constant torque against the direction of turning."""
 
 from .drive_coulomb_friction import EFFECT as DRIVE_EFFECT
-from .effect import JointTorqueEffect
+from .kinds import JointTorqueEffect
 
 EFFECT = JointTorqueEffect(
     name="steer_coulomb_friction",

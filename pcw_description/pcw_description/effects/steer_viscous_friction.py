@@ -1,7 +1,7 @@
 """Viscous friction of the steering: a torque proportional to its rate, against it."""
 
 from .drive_viscous_friction import EFFECT as DRIVE_EFFECT
-from .effect import JointTorqueEffect
+from .kinds import JointTorqueEffect
 
 EFFECT = JointTorqueEffect(
     name="steer_viscous_friction",

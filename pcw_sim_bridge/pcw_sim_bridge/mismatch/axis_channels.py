@@ -16,7 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pcw_description.axis_recording import TARGET, AxisDescription, AxisRecording
-from pcw_description.effects.effect import Effect, EffectParameter, JointTorqueEffect
+from pcw_description.effects.effect import Effect, EffectParameter
+from pcw_description.effects.kinds import JointTorqueEffect
 from pcw_description.effects.registry import all_effects
 
 from .errors import MismatchError

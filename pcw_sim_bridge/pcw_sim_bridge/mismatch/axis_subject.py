@@ -16,7 +16,7 @@ from pcw_description.axis_recording import (
     read_axis_recording,
 )
 from pcw_description.effect_instance import EffectInstance
-from pcw_description.effects.effect import JointTorqueEffect
+from pcw_description.effects.kinds import JointTorqueEffect
 from pcw_description.effects.registry import get
 
 from .axis_channels import AxisProblemBuilder, axis_motion

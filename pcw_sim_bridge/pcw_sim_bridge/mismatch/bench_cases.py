@@ -17,7 +17,7 @@ from scipy import signal
 from pcw_description.axis_recording import TARGET, AxisDescription, AxisRecording, parse_axis_description
 from pcw_description.compiled import compiled, joint_torque_list
 from pcw_description.effect_instance import EffectInstance
-from pcw_description.effects.effect import JointTorqueEffect
+from pcw_description.effects.kinds import JointTorqueEffect
 from pcw_description.effects.registry import get
 
 from .regression_problem import FloatArray

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pcw_description.effects.effect import DescriptionEffect, JointTorqueEffect
+from pcw_description.effects.kinds import DescriptionEffect, JointTorqueEffect
 from pcw_description.effects.registry import all_effects
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
@@ -287,9 +287,11 @@ class RobotProblemBuilder:
 
     # -- effects ------------------------------------------------------------------------------------------------
 
-    def _joint_columns(self, effect: JointTorqueEffect, casters: Sequence[int], shape: Shape) -> FloatArray:
-        """Columns (T, C, P) of an effect at work on some casters with common parameters."""
-        axis = AXIS_NAMES.index(effect.axis)
+    def _joint_columns(
+        self, effect: JointTorqueEffect, casters: Sequence[int], shape: Shape, at: str | None = None
+    ) -> FloatArray:
+        """Columns (T, C, P) of an effect at work on some casters with common parameters, at the axis `at` or its own."""
+        axis = AXIS_NAMES.index(at or effect.axis)
         width = len(self.channels())
         names = [parameter.name for parameter in effect.linear_parameters]
         pieces = []
@@ -362,7 +364,7 @@ class RobotProblemBuilder:
                 casters = [self.robot.caster_index(name) for name in instance.target]
                 shape = {p.name: instance.parameters[p.name] for p in effect.nonlinear_parameters}
                 weights = np.array([instance.parameters[p.name] for p in effect.linear_parameters])
-                total += self._joint_columns(effect, casters, shape) @ weights
+                total += self._joint_columns(effect, casters, shape, instance.axis) @ weights
         return total
 
     def _terms(self, sides: Sequence[tuple[FloatArray, FloatArray]], measured: FloatArray) -> list[Term]:
@@ -381,7 +383,7 @@ class RobotProblemBuilder:
                     continue
                 for target, casters in groups:
                     terms.append(self._joint_term(effect, target, casters, shapes, float(size)))
-            elif isinstance(effect, DescriptionEffect) and effect.target_kind == "chassis":
+            elif isinstance(effect, DescriptionEffect) and effect.target_kind == "chassis" and effect.linear_parameters:
                 terms.append(self._description_term(effect, sides))
         return terms
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pcw_description.recording import Recording
-from pcw_description.robot_description import DRIVE, RobotDescription
+from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
 
 from .regression_problem import BoolArray, FloatArray
 from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
@@ -114,7 +114,7 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
     """
     contact = robot.contact
     # Slip stiffness 2 mu_p F_z / lambda_p over the relaxation length: the spring between wheel and ground, per unit mass.
-    stiffness = 2.0 * contact.mu_p * 9.81 / (contact.lambda_p * contact.relaxation_length)
+    stiffness = 2.0 * contact.mu_p * GRAVITY / (contact.lambda_p * contact.relaxation_length)
     cutoffs = [LARGEST_CUTOFF, TYRE_MARGIN * float(np.sqrt(stiffness)) / (2.0 * np.pi)]
     for recording in recordings:
         joints = recording.joint_states

@@ -26,9 +26,9 @@ import numpy as np
 from pcw_description.augmented_object_model import dynamic_parameters
 from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import forward_kinematics_kernel
-from pcw_description.robot_description import DRIVE, STEER, RobotDescription
+from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
 
-from ..plants.reduced import support_forces
+from ..plants.support_forces import support_forces
 from .regression_problem import FloatArray
 from .robot_motion import RobotMotion
 from .signal_filter import derivative
@@ -203,12 +203,16 @@ def _normal_forces(mass, com_x, com_y, com_z, steer_axis, caster_offset, steer_a
     """Quasi-static normal forces (T, n) [N] from the accelerations (T, 2)."""
     normal = np.empty_like(steer_angle)
     centre = np.empty_like(steer_axis)
+    level = np.zeros(len(steer_axis))
     for t in range(len(steer_angle)):
         for i in range(steer_angle.shape[1]):
             c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
             centre[i, 0] = steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
             centre[i, 1] = steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
-        support_forces(mass, com_x, com_y, com_z, acceleration[t, 0], acceleration[t, 1], centre, normal[t])
+        moment_x = mass * (GRAVITY * com_x - com_z * acceleration[t, 0])
+        moment_y = mass * (GRAVITY * com_y - com_z * acceleration[t, 1])
+        # On level ground the load does not depend on how stiff equal springs are.
+        support_forces(mass * GRAVITY, moment_x, moment_y, 1.0, centre, level, normal[t])
     return normal
 
 

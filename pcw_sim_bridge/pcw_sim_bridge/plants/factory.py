@@ -8,7 +8,7 @@ from .plant import PLANT_NAMES, Plant, PlantError
 from .reduced import ReducedPlant
 
 
-def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool = False) -> Plant:
+def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool = False, lifted: bool = False) -> Plant:
     """Make a plant of the robot.
 
     Args:
@@ -16,6 +16,7 @@ def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool =
         robot: the robot, with the effects of its `physics` at work.
         dt: step [s].
         gui: show a window (PyBullet only).
+        lifted: on a jack, the wheels off the ground.
 
     Raises:
         PlantError: unknown name or a step that is not in 0.0001 to 0.005 s.
@@ -27,7 +28,7 @@ def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool =
         raise PlantError(f"dt = {dt!r} s is not allowed; allowed: 0.0001 to 0.005 s")
     robot.require_torque_control()
     if name == "reduced":
-        return ReducedPlant(robot, dt)
+        return ReducedPlant(robot, dt, lifted)
     from .pybullet_plant import PybulletPlant  # the engine takes a while to load, and prints a line
 
-    return PybulletPlant(robot, dt, gui)
+    return PybulletPlant(robot, dt, gui, lifted)

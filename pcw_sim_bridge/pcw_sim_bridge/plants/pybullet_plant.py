@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
+from pcw_description.robot_description import DRIVE, STATIC_DEFLECTION, STEER, FloatArray, RobotDescription
 from pcw_description.urdf import robot_urdf
 
 from .caster_arrays import (
@@ -23,25 +23,27 @@ from .caster_arrays import (
     MOTOR_PHI,
     MOTOR_RHO,
     PHI,
+    PHI_DDOT,
     PHI_DOT,
     RHO,
+    RHO_DDOT,
     RHO_DOT,
     SLIP_X,
     SLIP_Y,
     WHEEL_STATE,
+    ZX,
+    ZY,
     caster_numbers,
 )
-from .joint_effects import JointEffects
-from .nominal_changes import as_it_really_is
-from .plant import PlantError, PlantState
-from .reduced import GRAVITY
+from .effect_tables import EffectTables
+from .plant import PlantError, PlantState, gravity_in_base
 from .spatial_contact import contact_wrench, rotation_matrix
+from .true_robot import as_it_really_is, without_geared_rotors
 
-# Static deflection of the suspension [m] and its damping ratio: stiff enough to follow the load, soft for the step.
-STATIC_DEFLECTION = 1.5e-3
-DAMPING_RATIO = 0.4
 # Time for the robot to sink into its springs after a reset [s].
 SETTLING_TIME = 0.5
+# A lifted robot's wheels hang so far above the ground [m].
+LIFT = 0.1
 
 
 class PybulletPlant:
@@ -51,28 +53,31 @@ class PybulletPlant:
         robot: the robot; its `physics` are at work.
         dt: step [s].
         gui: show Bullet's window.
+        lifted: the robot stands on a jack, its wheels off the ground.
 
     Raises:
         PlantError: fewer than three casters, which cannot stand, or Bullet cannot start.
     """
 
-    def __init__(self, robot: RobotDescription, dt: float = 1e-3, gui: bool = False) -> None:
+    def __init__(self, robot: RobotDescription, dt: float = 1e-3, gui: bool = False, lifted: bool = False) -> None:
         robot.require_torque_control()
-        if robot.n < 3:
+        if robot.n < 3 and not lifted:
             raise PlantError(
                 f"{robot.name} has {robot.n} casters; the PyBullet plant needs at least 3 to stand (use the reduced plant)"
             )
         self.robot = robot
         self.dt = dt
-        self._true_robot = as_it_really_is(robot)
+        self._lifted = lifted
+        true_robot = as_it_really_is(robot)
+        # The engine carries the rotors that turn with the joints.
+        self._true_robot = without_geared_rotors(true_robot)
+        self._effects = EffectTables(true_robot, dt)
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self._client < 0:
             raise PlantError("PyBullet could not start" + (" its window; is a display there?" if gui else ""))
         self._casters = caster_numbers(self._true_robot)
-        self._effects = JointEffects(robot)
-        wheel_load = self._true_robot.total_mass / robot.n
-        stiffness = wheel_load * GRAVITY / STATIC_DEFLECTION
-        self._suspension = np.array([stiffness, 2.0 * DAMPING_RATIO * math.sqrt(stiffness * wheel_load)])
+        suspension = true_robot.wheel_suspension
+        self._suspension = np.array([suspension.stiffness, suspension.damping])
         self._armature = np.ascontiguousarray(self._true_robot.armature[:, DRIVE, DRIVE])
         self._wheels = np.zeros((robot.n, WHEEL_STATE))
         self._load()
@@ -80,13 +85,16 @@ class PybulletPlant:
 
     def _load(self) -> None:
         client, robot = self._client, self._true_robot
-        pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        pybullet.setGravity(*self._effects.gravity.tolist(), physicsClientId=client)
         pybullet.setTimeStep(self.dt, physicsClientId=client)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
             path.write_text(robot_urdf(robot), encoding="utf-8")
             self._body = pybullet.loadURDF(
-                str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+                str(path),
+                useFixedBase=self._lifted,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                physicsClientId=client,
             )
         indices = {}
         for index in range(pybullet.getNumJoints(self._body, physicsClientId=client)):
@@ -128,24 +136,43 @@ class PybulletPlant:
         start = np.zeros(3) if pose is None else np.asarray(pose, dtype=float)
         headings = np.zeros(self.robot.n) if steer_angle is None else np.asarray(steer_angle, dtype=float)
         self._wheels[:] = 0.0
-        self._joint_acceleration = np.zeros((self.robot.n, 2))
         self._acceleration = np.zeros(3)
         self._yaw = float(start[2])
+        self._steps = 0
+        self._effects.reset()
+        if self._lifted:
+            self._place(start, headings, height=LIFT, tilt=(0.0, 0.0))
+            return
         self._place(start, headings, height=-STATIC_DEFLECTION, tilt=(0.0, 0.0))
         # Let the springs take the load, then put the settled robot exactly where it was asked for.
         for _ in range(round(SETTLING_TIME / self.dt)):
             self._single_step(np.zeros((self.robot.n, 2)))
+            self._stop_all_but_sinking(headings)
         position, quaternion = self._base
         roll, pitch, _ = pybullet.getEulerFromQuaternion(quaternion)
         origin = np.array(position) - rotation_matrix(np.array(quaternion)) @ self._com_in_base
         normal_force = self._wheels[:, FZ].copy()
         self._wheels[:] = 0.0
         self._wheels[:, FZ] = normal_force
+        self._effects.reset()
         self._place(start, headings, height=float(origin[2]), tilt=(roll, pitch))
-        self._joint_acceleration[:] = 0.0
+        self._wheels[:, RHO_DDOT : PHI_DDOT + 1] = 0.0
         self._acceleration[:] = 0.0
         self._yaw = float(start[2])
-        self._time = 0.0
+        self._steps = 0
+
+    def set_motion(self, twist: FloatArray, joint_position: FloatArray, joint_velocity: FloatArray) -> None:
+        """Give the robot a twist (3,) in base_link and its joints angles and rates (n, 2), to go on from there."""
+        client = self._client
+        for joint, angle, rate in zip(self._joints, joint_position.ravel(), joint_velocity.ravel(), strict=True):
+            pybullet.resetJointState(self._body, joint, float(angle), float(rate), physicsClientId=client)
+        if not self._lifted:
+            rotation = rotation_matrix(np.array(self._base[1]))
+            spin = np.array([0.0, 0.0, twist[2]])
+            velocity = rotation @ np.array([twist[0], twist[1], 0.0]) + np.cross(spin, rotation @ self._com_in_base)
+            pybullet.resetBaseVelocity(self._body, velocity.tolist(), spin.tolist(), physicsClientId=client)
+        self._read()
+        self._effects.align_motors(joint_position, joint_velocity)
 
     def _place(
         self, pose: FloatArray, headings: FloatArray, height: float, tilt: tuple[float, float]
@@ -158,14 +185,25 @@ class PybulletPlant:
             self._body, position.tolist(), quaternion, physicsClientId=client
         )
         pybullet.resetBaseVelocity(self._body, [0.0] * 3, [0.0] * 3, physicsClientId=client)
-        for i, heading in enumerate(headings):
-            pybullet.resetJointState(
-                self._body, self._joints[2 * i + DRIVE], 0.0, 0.0, physicsClientId=client
-            )
-            pybullet.resetJointState(
-                self._body, self._joints[2 * i + STEER], float(heading), 0.0, physicsClientId=client
-            )
+        self._put_joints(headings)
         self._read()
+        self._effects.align_motors(self._wheels[:, RHO : PHI + 1], self._wheels[:, RHO_DOT : PHI_DOT + 1])
+
+    def _put_joints(self, headings: FloatArray) -> None:
+        client = self._client
+        for i, heading in enumerate(headings):
+            pybullet.resetJointState(self._body, self._joints[2 * i + DRIVE], 0.0, 0.0, physicsClientId=client)
+            pybullet.resetJointState(self._body, self._joints[2 * i + STEER], float(heading), 0.0, physicsClientId=client)
+
+    def _stop_all_but_sinking(self, headings: FloatArray) -> None:
+        """Let a settling robot neither roll nor slide: on a slope, or on a wheel out of true, it would leave its place."""
+        linear, angular = self._velocity
+        pybullet.resetBaseVelocity(
+            self._body, [0.0, 0.0, linear[2]], [angular[0], angular[1], 0.0], physicsClientId=self._client
+        )
+        self._put_joints(headings)
+        self._read()
+        self._wheels[:, ZX : ZY + 1] = 0.0  # nor do the tyres hold it in a tilt
 
     def _read(self) -> None:
         """Read the engine's state once; a step and the truth both use it."""
@@ -178,25 +216,24 @@ class PybulletPlant:
         self._wheels[:, RHO_DOT : PHI_DOT + 1] = joints[:, :, 1]
 
     def _single_step(self, command: FloatArray) -> None:
-        client = self._client
+        client, effects = self._client, self._effects
         position, quaternion = self._base
         linear, angular = self._velocity
         before = self._wheels[:, RHO_DOT : PHI_DOT + 1].copy()
         wrench, joint_torque = contact_wrench(
             self.dt,
+            self._steps * self.dt,
+            self._true_robot.chassis.mass,
             self._casters,
-            self._effects.kernels,
-            self._effects.place,
-            self._effects.numbers,
             self._suspension,
             self._armature,
+            effects.compiled,
             command,
-            np.array(quaternion),
             np.array(position),
+            np.array(quaternion),
             np.array(linear),
             np.array(angular),
             self._com_in_base,
-            self._joint_acceleration,
             self._acceleration[2],
             self._wheels,
         )
@@ -215,11 +252,12 @@ class PybulletPlant:
         )
         pybullet.stepSimulation(physicsClientId=client)
         self._read()
-        self._joint_acceleration = (self._wheels[:, RHO_DOT : PHI_DOT + 1] - before) / self.dt
+        self._wheels[:, RHO_DDOT : PHI_DDOT + 1] = (self._wheels[:, RHO_DOT : PHI_DOT + 1] - before) / self.dt
         self._acceleration[0] = (self._velocity[0][0] - linear[0]) / self.dt
         self._acceleration[1] = (self._velocity[0][1] - linear[1]) / self.dt
         self._acceleration[2] = (self._velocity[1][2] - angular[2]) / self.dt
         self._yaw += self.dt * self._velocity[1][2]
+        self._steps += 1
 
     def step(self, motor_torque: FloatArray, steps: int = 1) -> None:
         """Advance by `steps` steps of dt with motor torques (n, 2) [N m] held.
@@ -231,7 +269,6 @@ class PybulletPlant:
             raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
         for _ in range(steps):
             self._single_step(motor_torque)
-        self._time += steps * self.dt
 
     def state(self) -> PlantState:
         """Return the truth now; the pose is that of base_link's origin, seen from above."""
@@ -258,13 +295,18 @@ class PybulletPlant:
             ]
         )
         wheels = self._wheels
+        joint_position, joint_velocity = wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
+        motor_position, motor_velocity = self._effects.motor_motion(joint_position, joint_velocity)
         return PlantState(
-            time=self._time,
+            time=self._steps * self.dt,
             pose=np.array([origin[0], origin[1], yaw]),
             twist=np.array([*(to_base @ velocity), yaw_rate]),
             acceleration=np.array([*(to_base @ (self._acceleration[:2] + spin)), yaw_acceleration]),
-            joint_position=wheels[:, RHO : PHI + 1].copy(),
-            joint_velocity=wheels[:, RHO_DOT : PHI_DOT + 1].copy(),
+            gravity=gravity_in_base(self._effects.gravity, yaw),
+            joint_position=joint_position,
+            joint_velocity=joint_velocity,
+            motor_position=motor_position,
+            motor_velocity=motor_velocity,
             motor_torque=wheels[:, MOTOR_RHO : MOTOR_PHI + 1].copy(),
             slip=wheels[:, SLIP_X : SLIP_Y + 1].copy(),
             contact_force=wheels[:, FX : FY + 1].copy(),

@@ -9,8 +9,13 @@ wheel centres p, and the reflected rotors as armature on (rho, phi), the equatio
     rho:   I_rho rho_ddot + J_rp phi_ddot             = tau_rho - r F_x
 
 The joints are eliminated caster by caster, which leaves a 3x3 system (Schur complement). Normal forces follow the
-accelerations of the last step quasi-statically, as a rigid body on equal springs. Steps are semi-implicit; friction at
-the joints enters with its slope, so that Coulomb friction does not chatter at any step size.
+accelerations of the last step quasi-statically, as a rigid body on equal springs that push and do not pull.
+
+A step takes tyres, friction and gears implicitly in the new velocities, by their slopes. The tyre force F at the end of
+a step follows from the step's mean slip velocity eps = J (v + v') / 2: with G the slopes of F over eps, the matrix is
+M + dt/2 J^T G J. So no stiffness is too large for a step, and as the work of F is F . eps dt, no step adds energy.
+Inertial terms are taken at the middle of the step, positions by the trapezoidal rule; both keep a free motion's energy to
+second order.
 """
 
 from __future__ import annotations
@@ -20,7 +25,18 @@ import math
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import scrub_torque, tyre_step
+from pcw_description.contact.contact_model import scrub_torque, tyre_step_with_slopes
+from pcw_description.effects.kinds import (
+    CONTACT_RESULTS,
+    FORCE_INPUTS,
+    FORCE_RESULTS,
+    FRICTION,
+    GRADIENT_X,
+    GRADIENT_Y,
+    HEIGHT,
+    RADIUS_CHANGE,
+    RADIUS_SLOPE,
+)
 from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .caster_arrays import (
@@ -35,15 +51,15 @@ from .caster_arrays import (
     IZZ,
     J_PP,
     J_RP,
-    LIMIT_DRIVE,
-    LIMIT_STEER,
     MASS,
     MOTOR_PHI,
     MOTOR_RHO,
     PHI,
+    PHI_DDOT,
     PHI_DOT,
     RADIUS,
     RHO,
+    RHO_DDOT,
     RHO_DOT,
     SLIP_X,
     SLIP_Y,
@@ -55,55 +71,35 @@ from .caster_arrays import (
     ZY,
     caster_numbers,
 )
-from .joint_effects import JointEffects, joint_effect_torque
-from .nominal_changes import as_it_really_is
-from .plant import PlantError, PlantState
-
-GRAVITY = 9.81
+from .drivetrain import joint_torques, motor_torques, turn_motors
+from .effect_tables import EffectTables
+from .plant import PlantError, PlantState, gravity_in_base
+from .support_forces import support_forces
+from .surroundings import chassis_wrench, ground_under
+from .true_robot import as_it_really_is, without_geared_rotors
 
 # Entries of the chassis numbers and of the body state.
-_M, _COM_X, _COM_Y, _I, _COM_Z = range(5)
-_X, _Y, _YAW, _VX, _VY, _OMEGA, _AX, _AY, _ALPHA = range(9)
-
-
-@compiled
-def support_forces(mass, com_x, com_y, com_z, acc_x, acc_y, centre, normal_force):  # type: ignore[no-untyped-def]
-    """Fill normal_force (n,) [N]: equal springs under a rigid body with its inertial load, F_z = a + b p_x + c p_y.
-
-    With two casters the moment across their line is carried by nothing here; the ridge leaves it out.
-    """
-    n = len(normal_force)
-    sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(n):
-        x, y = centre[i, 0], centre[i, 1]
-        sx += x
-        sy += y
-        sxx += x * x
-        sxy += x * y
-        syy += y * y
-    weight = mass * GRAVITY
-    moment_x = weight * com_x - mass * com_z * acc_x
-    moment_y = weight * com_y - mass * com_z * acc_y
-    # Centred sums decouple the mean load from the two tilts.
-    mx, my = sx / n, sy / n
-    cxx, cxy, cyy = sxx - n * mx * mx, sxy - n * mx * my, syy - n * my * my
-    ridge = 1e-9 * (cxx + cyy)
-    cxx += ridge
-    cyy += ridge
-    rx, ry = moment_x - weight * mx, moment_y - weight * my
-    determinant = cxx * cyy - cxy * cxy
-    tilt_x = (cyy * rx - cxy * ry) / determinant
-    tilt_y = (cxx * ry - cxy * rx) / determinant
-    for i in range(n):
-        load = weight / n + tilt_x * (centre[i, 0] - mx) + tilt_y * (centre[i, 1] - my)
-        normal_force[i] = max(load, 0.0)
+_M, _COM_X, _COM_Y, _I, _COM_Z, _SPRING, _LIFTED = range(7)
+_X, _Y, _YAW, _VX, _VY, _OMEGA, _AX, _AY, _ALPHA, _TIME = range(10)
+# Per-caster numbers within a step: place and turn of the wheel, forces, and the two rows of what is eliminated.
+_C, _S, _PX, _PY, _FORCE_X, _FORCE_Y, _SPIN, _RHS_R, _RHS_P, _I_RR, _I_RP, _I_PP = range(12)
+_KR0, _KR1, _KR2, _KP0, _KP1, _KP2, _DZ_X, _DZ_Y, _G_X, _G_Y, _E_X0, _E_X1, _E_X2, _E_Y0, _E_Y1, _E_Y2, _R = range(12, 29)
+_SCRATCH = 29
 
 
 @compiled
 def _advance(  # type: ignore[no-untyped-def]
-    steps, dt, chassis, casters, effect_kernels, effect_place, effect_numbers, command, body, wheels
+    steps,
+    dt,
+    chassis,
+    casters,
+    gravity,
+    effects,
+    command,
+    body,
+    wheels,
 ):
-    """Advance body (9,) and wheels (n, 13) in place by `steps` steps with the motor torques command (n, 2) held.
+    """Advance body (10,) and wheels (n, WHEEL_STATE) in place by `steps` steps with the motor torques command (n, 2) held.
 
     Returns False, and changes nothing, if a torque is not finite.
     """
@@ -111,47 +107,72 @@ def _advance(  # type: ignore[no-untyped-def]
     for i in range(n):
         if not (math.isfinite(command[i, 0]) and math.isfinite(command[i, 1])):
             return False
-    centre = np.empty((n, 2))
-    normal = np.empty(n)
-    coupling = np.empty((n, 3))
-    inverse = np.empty((n, 3))
-    drive_rhs = np.empty(n)
-    steer_rhs = np.empty(n)
+    centre, height, normal = np.empty((n, 2)), np.zeros(n), np.empty(n)
+    ground, at, wrench = np.empty((n, CONTACT_RESULTS)), np.empty(FORCE_INPUTS), np.zeros(FORCE_RESULTS)
+    part = np.empty((n, _SCRATCH))
+    lifted = chassis[_LIFTED] > 0.0
     total_mass = chassis[_M]
     for i in range(n):
         total_mass += casters[i, MASS]
     for _ in range(steps):
+        # Velocities at the middle of the step, for the inertial terms.
         vx, vy, omega = body[_VX], body[_VY], body[_OMEGA]
+        half = 0.5 * dt
+        mid_x = vx + half * (body[_AX] + omega * vy)
+        mid_y = vy + half * (body[_AY] - omega * vx)
+        mid_omega = omega + half * body[_ALPHA]
+        mid_yaw = body[_YAW] + half * omega
+        cos_yaw, sin_yaw = math.cos(mid_yaw), math.sin(mid_yaw)
+        gravity_x = cos_yaw * gravity[0] + sin_yaw * gravity[1]
+        gravity_y = -sin_yaw * gravity[0] + cos_yaw * gravity[1]
         mass, cx, cy = chassis[_M], chassis[_COM_X], chassis[_COM_Y]
-        m00, m02, m11, m12 = mass, -mass * cy, mass, mass * cx
-        m01, m22 = 0.0, chassis[_I] + mass * (cx * cx + cy * cy)
-        f0 = mass * (omega * vy + omega * omega * cx)
-        f1 = mass * (-omega * vx + omega * omega * cy)
-        f2 = -mass * omega * (cx * vx + cy * vy)
         com_x, com_y, com_z = mass * cx, mass * cy, mass * chassis[_COM_Z]
         for i in range(n):
-            c, s = math.cos(wheels[i, PHI]), math.sin(wheels[i, PHI])
+            angle = wheels[i, PHI] + half * wheels[i, PHI_DOT]
+            c, s = math.cos(angle), math.sin(angle)
+            part[i, _C], part[i, _S] = c, s
             centre[i, 0] = casters[i, SX] + casters[i, BX] * c - casters[i, BY] * s
             centre[i, 1] = casters[i, SY] + casters[i, BX] * s + casters[i, BY] * c
             com_x += casters[i, MASS] * (casters[i, SX] + casters[i, CX] * c - casters[i, CY] * s)
             com_y += casters[i, MASS] * (casters[i, SY] + casters[i, CX] * s + casters[i, CY] * c)
             com_z += casters[i, MASS] * casters[i, RADIUS]
-        support_forces(
-            total_mass,
-            com_x / total_mass,
-            com_y / total_mass,
-            com_z / total_mass,
-            body[_AX],
-            body[_AY],
-            centre,
-            normal,
+            world_x = body[_X] + half * (cos_yaw * vx - sin_yaw * vy) + cos_yaw * centre[i, 0] - sin_yaw * centre[i, 1]
+            world_y = body[_Y] + half * (sin_yaw * vx + cos_yaw * vy) + sin_yaw * centre[i, 0] + cos_yaw * centre[i, 1]
+            roll_angle = wheels[i, RHO] + half * wheels[i, RHO_DOT]
+            ground_under(i, body[_TIME], world_x, world_y, roll_angle, wheels[i, FZ], effects, at, ground[i])
+            height[i] = ground[i, HEIGHT] + ground[i, RADIUS_CHANGE]
+        com_x, com_y, com_z = com_x / total_mass, com_y / total_mass, com_z / total_mass
+        chassis_wrench(
+            body[_TIME], body[_X], body[_Y], body[_YAW], vx, vy, omega, com_x, com_y, com_z, effects, at, wrench
         )
+        if lifted:
+            normal[:] = 0.0
+        else:
+            weight = -total_mass * gravity[2]
+            support_forces(
+                weight - wrench[2],
+                weight * com_x - total_mass * com_z * (body[_AX] - gravity_x) + wrench[4],
+                weight * com_y - total_mass * com_z * (body[_AY] - gravity_y) - wrench[3],
+                chassis[_SPRING],
+                centre,
+                height,
+                normal,
+            )
+        m00, m02, m11, m12 = mass, -mass * cy, mass, mass * cx
+        m01, m22 = 0.0, chassis[_I] + mass * (cx * cx + cy * cy)
+        bias_x = -mid_omega * mid_y - mid_omega * mid_omega * cx - gravity_x
+        bias_y = mid_omega * mid_x - mid_omega * mid_omega * cy - gravity_y
+        f0 = wrench[0] - mass * bias_x
+        f1 = wrench[1] - mass * bias_y
+        f2 = wrench[5] - mass * (cx * bias_y - cy * bias_x)
         for i in range(n):
-            c, s = math.cos(wheels[i, PHI]), math.sin(wheels[i, PHI])
-            rho_dot, phi_dot = wheels[i, RHO_DOT], wheels[i, PHI_DOT]
+            row = part[i]
+            wheel = wheels[i]
+            c, s = row[_C], row[_S]
+            rho_dot, phi_dot = wheel[RHO_DOT], wheel[PHI_DOT]
             sigma = phi_dot + omega
             sx, sy, bx, by = casters[i, SX], casters[i, SY], casters[i, BX], casters[i, BY]
-            radius = casters[i, RADIUS]
+            radius = casters[i, RADIUS] + ground[i, RADIUS_CHANGE]
             # Velocity of the wheel centre in the wheel frame.
             axis_x, axis_y = vx - omega * sy, vy + omega * sx
             along = c * axis_x + s * axis_y - sigma * by
@@ -159,19 +180,37 @@ def _advance(  # type: ignore[no-untyped-def]
             slip_x, slip_y = radius * rho_dot - along, -across
             speed = max(abs(radius * rho_dot), math.sqrt(along * along + across * across))
             tyre = casters[i, TYRE:]
-            zx, zy, fx, fy = tyre_step(
-                tyre, wheels[i, ZX], wheels[i, ZY], slip_x, slip_y, speed, normal[i], dt
+            grip = normal[i] * ground[i, FRICTION]
+            zx, zy, fx, fy, row[_DZ_X], row[_DZ_Y], gx, gy = tyre_step_with_slopes(
+                tyre, wheel[ZX], wheel[ZY], slip_x, slip_y, speed, grip, dt
             )
-            spin = scrub_torque(tyre, sigma, speed, normal[i])
-            wheels[i, ZX], wheels[i, ZY] = zx, zy
-            wheels[i, SLIP_X], wheels[i, SLIP_Y] = slip_x, slip_y
-            wheels[i, FX], wheels[i, FY], wheels[i, FZ] = fx, fy, normal[i]
-            force_x, force_y = c * fx - s * fy, s * fx + c * fy
+            spin = scrub_torque(tyre, sigma, speed, grip)
+            wheel[ZX], wheel[ZY], wheel[FX], wheel[FY], wheel[FZ] = zx, zy, fx, fy, normal[i]
+            wheel[SLIP_X], wheel[SLIP_Y] = slip_x, slip_y
+            row[_G_X], row[_G_Y] = gx, gy
+            # The ground's gradient tilts the normal force, which goes through the wheel centre.
+            climb_x = -normal[i] * (cos_yaw * ground[i, GRADIENT_X] + sin_yaw * ground[i, GRADIENT_Y])
+            climb_y = -normal[i] * (-sin_yaw * ground[i, GRADIENT_X] + cos_yaw * ground[i, GRADIENT_Y])
+            force_x, force_y = c * fx - s * fy + climb_x, s * fx + c * fy + climb_y
             f0 += force_x
             f1 += force_y
             f2 += centre[i, 0] * force_y - centre[i, 1] * force_x + spin
+            # Slip velocity over the twist: eps_x = r rho_dot + by phi_dot + ex . V,  eps_y = -bx phi_dot + ey . V.
+            ex0, ex1, ex2 = -c, -s, c * sy - s * sx + by
+            ey0, ey1, ey2 = s, -c, -s * sy - c * sx - bx
+            row[_E_X0], row[_E_X1], row[_E_X2] = ex0, ex1, ex2
+            row[_E_Y0], row[_E_Y1], row[_E_Y2], row[_R] = ey0, ey1, ey2, radius
+            gx *= half
+            gy *= half
+            m00 += gx * ex0 * ex0 + gy * ey0 * ey0
+            m01 += gx * ex0 * ex1 + gy * ey0 * ey1
+            m02 += gx * ex0 * ex2 + gy * ey0 * ey2
+            m11 += gx * ex1 * ex1 + gy * ey1 * ey1
+            m12 += gx * ex1 * ex2 + gy * ey1 * ey2
+            m22 += gx * ex2 * ex2 + gy * ey2 * ey2
             # The module as a body at q = S + c, turning at sigma.
             m, izz = casters[i, MASS], casters[i, IZZ]
+            mid_sigma = mid_omega + phi_dot + half * wheel[PHI_DDOT]
             lever_x = casters[i, CX] * c - casters[i, CY] * s
             lever_y = casters[i, CX] * s + casters[i, CY] * c
             qx, qy = sx + lever_x, sy + lever_y
@@ -180,73 +219,86 @@ def _advance(  # type: ignore[no-untyped-def]
             m02 -= m * qy
             m12 += m * qx
             m22 += izz + m * (qx * qx + qy * qy)
-            bias_x = -omega * vy - omega * omega * sx - sigma * sigma * lever_x
-            bias_y = omega * vx - omega * omega * sy - sigma * sigma * lever_y
+            bias_x = -mid_omega * mid_y - mid_omega * mid_omega * sx - mid_sigma * mid_sigma * lever_x - gravity_x
+            bias_y = mid_omega * mid_x - mid_omega * mid_omega * sy - mid_sigma * mid_sigma * lever_y - gravity_y
             f0 -= m * bias_x
             f1 -= m * bias_y
             f2 -= m * (qx * bias_y - qy * bias_x)
-            coupling[i, 0], coupling[i, 1] = -m * lever_y, m * lever_x
-            coupling[i, 2] = izz + m * (qx * lever_x + qy * lever_y)
+            motor_torques(i, dt, casters[i], command[i], wheel, effects, at)
+            tau_rho, tau_phi, s_rr, s_rp, s_pp = joint_torques(i, dt, wheel, normal[i], effects)
+            force_across = fy - s * climb_x + c * climb_y
+            force_along = fx + c * climb_x + s * climb_y
+            rhs_r = tau_rho - radius * fx - normal[i] * ground[i, RADIUS_SLOPE]
+            rhs_p = tau_phi + bx * force_across - by * force_along + spin - m * (lever_x * bias_y - lever_y * bias_x)
+            inertia_rr = casters[i, I_ROLL] + dt * s_rr + gx * radius * radius
+            inertia_rp = casters[i, J_RP] + dt * s_rp + gx * radius * by
             inertia_pp = izz + m * (lever_x * lever_x + lever_y * lever_y) + casters[i, J_PP]
-            inertia_rr, inertia_rp = casters[i, I_ROLL], casters[i, J_RP]
-            motor_rho = min(max(command[i, 0], -casters[i, LIMIT_DRIVE]), casters[i, LIMIT_DRIVE])
-            motor_phi = min(max(command[i, 1], -casters[i, LIMIT_STEER]), casters[i, LIMIT_STEER])
-            wheels[i, MOTOR_RHO], wheels[i, MOTOR_PHI] = motor_rho, motor_phi
-            rhs_r = motor_rho - radius * fx
-            rhs_p = motor_phi + bx * fy - by * fx + spin - m * (lever_x * bias_y - lever_y * bias_x)
-            for k in range(len(effect_place)):
-                if effect_place[k, 0] == i:
-                    numbers = effect_numbers[k]
-                    if effect_place[k, 1] == 0:
-                        torque, slope = joint_effect_torque(
-                            effect_kernels[k], wheels[i, RHO], rho_dot, motor_rho, normal[i], numbers
-                        )
-                        rhs_r += torque
-                        inertia_rr += dt * slope
-                    else:
-                        torque, slope = joint_effect_torque(
-                            effect_kernels[k], wheels[i, PHI], phi_dot, motor_phi, normal[i], numbers
-                        )
-                        rhs_p += torque
-                        inertia_pp += dt * slope
+            inertia_pp += dt * s_pp + gx * by * by + gy * bx * bx
+            kr0, kr1, kr2 = gx * radius * ex0, gx * radius * ex1, gx * radius * ex2
+            kp0 = -m * lever_y + gx * by * ex0 - gy * bx * ey0
+            kp1 = m * lever_x + gx * by * ex1 - gy * bx * ey1
+            kp2 = izz + m * (qx * lever_x + qy * lever_y) + gx * by * ex2 - gy * bx * ey2
             determinant = inertia_rr * inertia_pp - inertia_rp * inertia_rp
-            inverse[i, 0], inverse[i, 1], inverse[i, 2] = (
-                inertia_pp / determinant,
-                -inertia_rp / determinant,
-                inertia_rr / determinant,
-            )
-            drive_rhs[i], steer_rhs[i] = rhs_r, rhs_p
+            i_rr, i_rp, i_pp = inertia_pp / determinant, -inertia_rp / determinant, inertia_rr / determinant
+            row[_I_RR], row[_I_RP], row[_I_PP] = i_rr, i_rp, i_pp
+            row[_RHS_R], row[_RHS_P] = rhs_r, rhs_p
+            row[_KR0], row[_KR1], row[_KR2] = kr0, kr1, kr2
+            row[_KP0], row[_KP1], row[_KP2] = kp0, kp1, kp2
             # Schur complement: what the caster takes from the body.
-            reach = inverse[i, 1] * rhs_r + inverse[i, 2] * rhs_p
-            k0, k1, k2, weight = coupling[i, 0], coupling[i, 1], coupling[i, 2], inverse[i, 2]
-            f0 -= k0 * reach
-            f1 -= k1 * reach
-            f2 -= k2 * reach
-            m00 -= k0 * k0 * weight
-            m01 -= k0 * k1 * weight
-            m02 -= k0 * k2 * weight
-            m11 -= k1 * k1 * weight
-            m12 -= k1 * k2 * weight
-            m22 -= k2 * k2 * weight
+            on_r, on_p = i_rr * rhs_r + i_rp * rhs_p, i_rp * rhs_r + i_pp * rhs_p
+            f0 -= kr0 * on_r + kp0 * on_p
+            f1 -= kr1 * on_r + kp1 * on_p
+            f2 -= kr2 * on_r + kp2 * on_p
+            ar0, ap0 = i_rr * kr0 + i_rp * kp0, i_rp * kr0 + i_pp * kp0
+            ar1, ap1 = i_rr * kr1 + i_rp * kp1, i_rp * kr1 + i_pp * kp1
+            ar2, ap2 = i_rr * kr2 + i_rp * kp2, i_rp * kr2 + i_pp * kp2
+            m00 -= kr0 * ar0 + kp0 * ap0
+            m01 -= kr0 * ar1 + kp0 * ap1
+            m02 -= kr0 * ar2 + kp0 * ap2
+            m11 -= kr1 * ar1 + kp1 * ap1
+            m12 -= kr1 * ar2 + kp1 * ap2
+            m22 -= kr2 * ar2 + kp2 * ap2
         a00, a01, a02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
         a11, a12, a22 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12, m00 * m11 - m01 * m01
         determinant = m00 * a00 + m01 * a01 + m02 * a02
         d0 = (a00 * f0 + a01 * f1 + a02 * f2) / determinant
         d1 = (a01 * f0 + a11 * f1 + a12 * f2) / determinant
         d2 = (a02 * f0 + a12 * f1 + a22 * f2) / determinant
-        body[_AX], body[_AY], body[_ALPHA] = d0 - omega * vy, d1 + omega * vx, d2
-        body[_VX], body[_VY], body[_OMEGA] = vx + dt * d0, vy + dt * d1, omega + dt * d2
-        middle = body[_YAW] + 0.5 * dt * body[_OMEGA]
-        c, s = math.cos(middle), math.sin(middle)
-        body[_X] += dt * (c * body[_VX] - s * body[_VY])
-        body[_Y] += dt * (s * body[_VX] + c * body[_VY])
-        body[_YAW] += dt * body[_OMEGA]
+        if lifted:  # held by what lifts it
+            d0, d1, d2 = 0.0, 0.0, 0.0
         for i in range(n):
-            rhs_p = steer_rhs[i] - (coupling[i, 0] * d0 + coupling[i, 1] * d1 + coupling[i, 2] * d2)
-            wheels[i, RHO_DOT] += dt * (inverse[i, 0] * drive_rhs[i] + inverse[i, 1] * rhs_p)
-            wheels[i, PHI_DOT] += dt * (inverse[i, 1] * drive_rhs[i] + inverse[i, 2] * rhs_p)
-            wheels[i, RHO] += dt * wheels[i, RHO_DOT]
-            wheels[i, PHI] += dt * wheels[i, PHI_DOT]
+            row = part[i]
+            wheel = wheels[i]
+            rhs_r = row[_RHS_R] - (row[_KR0] * d0 + row[_KR1] * d1 + row[_KR2] * d2)
+            rhs_p = row[_RHS_P] - (row[_KP0] * d0 + row[_KP1] * d1 + row[_KP2] * d2)
+            rho_ddot = row[_I_RR] * rhs_r + row[_I_RP] * rhs_p
+            phi_ddot = row[_I_RP] * rhs_r + row[_I_PP] * rhs_p
+            # The mean slip of the step beyond the one it began with.
+            bx, by = casters[i, BX], casters[i, BY]
+            more_x = row[_R] * rho_ddot + by * phi_ddot + row[_E_X0] * d0 + row[_E_X1] * d1 + row[_E_X2] * d2
+            more_y = -bx * phi_ddot + row[_E_Y0] * d0 + row[_E_Y1] * d1 + row[_E_Y2] * d2
+            more_x *= half
+            more_y *= half
+            wheel[ZX] += row[_DZ_X] * more_x
+            wheel[ZY] += row[_DZ_Y] * more_y
+            wheel[FX] += row[_G_X] * more_x
+            wheel[FY] += row[_G_Y] * more_y
+            wheel[SLIP_X] += more_x
+            wheel[SLIP_Y] += more_y
+            wheel[RHO] += dt * (wheel[RHO_DOT] + half * rho_ddot)
+            wheel[PHI] += dt * (wheel[PHI_DOT] + half * phi_ddot)
+            wheel[RHO_DOT] += dt * rho_ddot
+            wheel[PHI_DOT] += dt * phi_ddot
+            wheel[RHO_DDOT], wheel[PHI_DDOT] = rho_ddot, phi_ddot
+            turn_motors(i, dt, wheel[RHO_DOT], wheel[PHI_DOT], effects)
+        mean_x, mean_y = vx + half * d0, vy + half * d1
+        body[_X] += dt * (cos_yaw * mean_x - sin_yaw * mean_y)
+        body[_Y] += dt * (sin_yaw * mean_x + cos_yaw * mean_y)
+        body[_YAW] += dt * (omega + half * d2)
+        body[_VX], body[_VY], body[_OMEGA] = vx + dt * d0, vy + dt * d1, omega + dt * d2
+        # Of base_link's origin in space, at the middle of the step.
+        body[_AX], body[_AY], body[_ALPHA] = d0 - (omega + half * d2) * mean_y, d1 + (omega + half * d2) * mean_x, d2
+        body[_TIME] += dt
     return True
 
 
@@ -256,39 +308,43 @@ class ReducedPlant:
     Args:
         robot: the robot; its `physics` are at work.
         dt: step [s].
+        lifted: the robot stands on a jack, its wheels off the ground.
     """
 
-    def __init__(self, robot: RobotDescription, dt: float = 1e-3) -> None:
+    def __init__(self, robot: RobotDescription, dt: float = 1e-3, lifted: bool = False) -> None:
         robot.require_torque_control()
         self.robot = robot
         self.dt = dt
         true_robot = as_it_really_is(robot)
         chassis = true_robot.chassis
+        spring = true_robot.wheel_suspension.stiffness
         self._chassis = np.array(
-            [chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2]]
+            [chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2], spring, float(lifted)]
         )
-        self._casters = caster_numbers(true_robot)
-        self._effects = JointEffects(robot)
-        self._body = np.zeros(9)
+        self._casters = caster_numbers(without_geared_rotors(true_robot))
+        self._effects = EffectTables(true_robot, dt)
+        self._body = np.zeros(10)
         self._wheels = np.zeros((robot.n, WHEEL_STATE))
-        self._time = 0.0
         self.reset()
 
     def reset(self, pose: FloatArray | None = None, steer_angle: FloatArray | None = None) -> None:
         """Put the robot at rest at a pose (3,), the wheels at headings (n,); time becomes zero."""
         self._body[:] = 0.0
         self._wheels[:] = 0.0
-        self._time = 0.0
+        self._effects.reset()
+        self._steps = 0
         if pose is not None:
             self._body[[_X, _Y, _YAW]] = pose
         if steer_angle is not None:
             self._wheels[:, PHI] = steer_angle
+        self._effects.align_motors(self._wheels[:, RHO : PHI + 1], self._wheels[:, RHO_DOT : PHI_DOT + 1])
 
     def set_motion(self, twist: FloatArray, joint_position: FloatArray, joint_velocity: FloatArray) -> None:
-        """Give the robot a twist (3,) in base_link and its joints angles and rates (n, 2), to go on from a recorded motion."""
+        """Give the robot a twist (3,) in base_link and its joints angles and rates (n, 2), to go on from there."""
         self._body[_VX : _OMEGA + 1] = twist
         self._wheels[:, RHO : PHI + 1] = joint_position
         self._wheels[:, RHO_DOT : PHI_DOT + 1] = joint_velocity
+        self._effects.align_motors(joint_position, joint_velocity)
 
     def step(self, motor_torque: FloatArray, steps: int = 1) -> None:
         """Advance by `steps` steps of dt with motor torques (n, 2) [N m] held.
@@ -296,31 +352,37 @@ class ReducedPlant:
         Raises:
             PlantError: a torque is NaN or infinite; the plant has not moved.
         """
+        effects = self._effects
+        self._body[_TIME] = self._steps * self.dt
         if not _advance(
             steps,
             self.dt,
             self._chassis,
             self._casters,
-            self._effects.kernels,
-            self._effects.place,
-            self._effects.numbers,
+            effects.gravity,
+            effects.compiled,
             motor_torque,
             self._body,
             self._wheels,
         ):
             raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
-        self._time += steps * self.dt
+        self._steps += steps
 
     def state(self) -> PlantState:
         """Return the truth now."""
         body, wheels = self._body, self._wheels
+        joint_position, joint_velocity = wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
+        motor_position, motor_velocity = self._effects.motor_motion(joint_position, joint_velocity)
         return PlantState(
-            time=self._time,
+            time=self._steps * self.dt,
             pose=body[_X : _YAW + 1].copy(),
             twist=body[_VX : _OMEGA + 1].copy(),
             acceleration=body[_AX : _ALPHA + 1].copy(),
-            joint_position=wheels[:, RHO : PHI + 1].copy(),
-            joint_velocity=wheels[:, RHO_DOT : PHI_DOT + 1].copy(),
+            gravity=gravity_in_base(self._effects.gravity, body[_YAW]),
+            joint_position=joint_position,
+            joint_velocity=joint_velocity,
+            motor_position=motor_position,
+            motor_velocity=motor_velocity,
             motor_torque=wheels[:, MOTOR_RHO : MOTOR_PHI + 1].copy(),
             slip=wheels[:, SLIP_X : SLIP_Y + 1].copy(),
             contact_force=wheels[:, FX : FY + 1].copy(),

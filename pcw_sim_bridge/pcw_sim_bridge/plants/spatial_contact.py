@@ -18,10 +18,23 @@ import numpy as np
 
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import scrub_torque, tyre_step
+from pcw_description.effects.kinds import (
+    CONTACT_RESULTS,
+    FORCE_INPUTS,
+    FORCE_RESULTS,
+    FRICTION,
+    GRADIENT_X,
+    GRADIENT_Y,
+    HEIGHT,
+    RADIUS_CHANGE,
+    RADIUS_SLOPE,
+)
 
 from .caster_arrays import (
     BX,
     BY,
+    CX,
+    CY,
     FX,
     FY,
     FZ,
@@ -29,14 +42,13 @@ from .caster_arrays import (
     IZZ,
     J_PP,
     J_RP,
-    LIMIT_DRIVE,
-    LIMIT_STEER,
-    MOTOR_PHI,
-    MOTOR_RHO,
+    MASS,
     PHI,
+    PHI_DDOT,
     PHI_DOT,
     RADIUS,
     RHO,
+    RHO_DDOT,
     RHO_DOT,
     SLIP_X,
     SLIP_Y,
@@ -46,7 +58,8 @@ from .caster_arrays import (
     ZX,
     ZY,
 )
-from .joint_effects import joint_effect_torque
+from .drivetrain import joint_torques, motor_torques, turn_motors
+from .surroundings import chassis_wrench, ground_under
 
 
 @compiled
@@ -90,19 +103,18 @@ def _joint_inertia(caster, along):  # type: ignore[no-untyped-def]
 @compiled
 def contact_wrench(  # type: ignore[no-untyped-def]
     dt,
+    time,
+    chassis_mass,
     casters,
-    effect_kernels,
-    effect_place,
-    effect_numbers,
     suspension,
     drive_armature,
+    effects,
     command,
+    position,
     quaternion,
-    com_position,
-    com_velocity,
+    linear_velocity,
     angular_velocity,
     com_in_base,
-    joint_acceleration,
     yaw_acceleration,
     wheels,
 ):
@@ -110,33 +122,42 @@ def contact_wrench(  # type: ignore[no-untyped-def]
 
     Args:
         dt: step [s].
+        time: since the start [s].
+        chassis_mass: of the base link [kg].
         casters: constant numbers (n, TYRE + TYRE_SIZE).
-        effect_kernels, effect_place, effect_numbers: see `JointEffects`.
         suspension: vertical stiffness [N/m] and damping [N s/m] of one wheel.
         drive_armature: rotor inertia carried by each wheel body (n,) [kg m^2].
+        effects: see `EffectTables`.
         command: motor torques (n, 2) [N m], limited here.
-        quaternion, com_position, com_velocity, angular_velocity: motion of the base link, world axes.
+        position, quaternion, linear_velocity, angular_velocity: motion of the base link's centre of mass, world axes.
         com_in_base: centre of mass of the base link in base_link (3,) [m].
-        joint_acceleration, yaw_acceleration: of the last step, (n, 2) and scalar [rad/s^2].
-        wheels: state (n, WHEEL_STATE); positions and velocities as the engine has them, the rest is filled here.
+        yaw_acceleration: of the last step [rad/s^2].
+        wheels: state (n, WHEEL_STATE); positions, velocities and the accelerations of the last step as the engine has
+            them, the rest is filled here.
     """
-    wrench = np.zeros(6)
-    joint_torque = np.zeros((len(casters), 2))
+    n = len(casters)
+    wrench, joint_torque = np.zeros(6), np.zeros((n, 2))
+    ground, at, push = np.empty(CONTACT_RESULTS), np.empty(FORCE_INPUTS), np.zeros(FORCE_RESULTS)
     rotation = rotation_matrix(quaternion)
     up = np.zeros(3)
     up[2] = 1.0
     axis = rotation[:, 2].copy()
-    for i in range(len(casters)):
+    com = chassis_mass * com_in_base
+    total_mass = chassis_mass
+    for i in range(n):
         row = wheels[i]
         c, s = math.cos(row[PHI]), math.sin(row[PHI])
-        radius = casters[i, RADIUS]
         # The steering axis at axle height, the wheel centre and the wheel's own axes, in the world.
         hub = np.empty(3)
-        hub[0], hub[1], hub[2] = casters[i, SX], casters[i, SY], radius
+        hub[0], hub[1], hub[2] = casters[i, SX], casters[i, SY], casters[i, RADIUS]
         offset = np.empty(3)
         offset[0] = casters[i, BX] * c - casters[i, BY] * s
         offset[1] = casters[i, BX] * s + casters[i, BY] * c
         offset[2] = 0.0
+        total_mass += casters[i, MASS]
+        com[0] += casters[i, MASS] * (casters[i, SX] + casters[i, CX] * c - casters[i, CY] * s)
+        com[1] += casters[i, MASS] * (casters[i, SY] + casters[i, CX] * s + casters[i, CY] * c)
+        com[2] += casters[i, MASS] * casters[i, RADIUS]
         side = np.empty(3)
         side[0], side[1], side[2] = -s, c, 0.0
         axle = rotation @ side
@@ -146,18 +167,21 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         forward /= math.sqrt(forward[0] * forward[0] + forward[1] * forward[1])
         across = _cross(up, forward)
         radial = _cross(forward, axle)
-        contact = arm - radius * radial
+        ground_under(i, time, position[0] + arm[0], position[1] + arm[1], row[RHO], row[FZ], effects, at, ground)
+        radius = casters[i, RADIUS] + ground[RADIUS_CHANGE]
+        # Out of round, the lowest point is ahead of the axle by the slope of the radius.
+        contact = arm - radius * radial + ground[RADIUS_SLOPE] * forward
         # Velocities of the wheel centre and of the tread at the contact.
         turning = angular_velocity + row[PHI_DOT] * axis
         centre_velocity = (
-            com_velocity + _cross(angular_velocity, arm) + row[PHI_DOT] * _cross(axis, from_axis)
+            linear_velocity + _cross(angular_velocity, arm) + row[PHI_DOT] * _cross(axis, from_axis)
         )
         tread_velocity = centre_velocity + _cross(turning + row[RHO_DOT] * axle, contact - arm)
-        penetration = -(com_position[2] + contact[2])
+        gradient_x, gradient_y = ground[GRADIENT_X], ground[GRADIENT_Y]
+        penetration = ground[HEIGHT] - (position[2] + contact[2])
+        sinking = gradient_x * centre_velocity[0] + gradient_y * centre_velocity[1] - tread_velocity[2]
         normal = (
-            max(suspension[0] * penetration - suspension[1] * tread_velocity[2], 0.0)
-            if penetration > 0.0
-            else 0.0
+            max(suspension[0] * penetration + suspension[1] * sinking, 0.0) if penetration > 0.0 else 0.0
         )
         slip_x = -(tread_velocity[0] * forward[0] + tread_velocity[1] * forward[1])
         slip_y = -(tread_velocity[0] * across[0] + tread_velocity[1] * across[1])
@@ -166,35 +190,60 @@ def contact_wrench(  # type: ignore[no-untyped-def]
             math.sqrt(centre_velocity[0] * centre_velocity[0] + centre_velocity[1] * centre_velocity[1]),
         )
         tyre = casters[i, TYRE:]
+        grip = normal * ground[FRICTION]
         row[ZX], row[ZY], force_x, force_y = tyre_step(
-            tyre, row[ZX], row[ZY], slip_x, slip_y, speed, normal, dt
+            tyre, row[ZX], row[ZY], slip_x, slip_y, speed, grip, dt
         )
-        spin = scrub_torque(tyre, turning[2], speed, normal)
+        spin = scrub_torque(tyre, turning[2], speed, grip)
         row[SLIP_X], row[SLIP_Y], row[FX], row[FY], row[FZ] = slip_x, slip_y, force_x, force_y, normal
         force = force_x * forward + force_y * across + normal * up
+        # On a gradient the normal force leans, and goes through the wheel centre.
+        lean = np.zeros(3)
+        lean[0], lean[1] = -normal * gradient_x, -normal * gradient_y
         moment = spin * up + _cross(turning, drive_armature[i] * row[RHO_DOT] * axle)
-        wrench[:3] += force
-        wrench[3:] += _cross(contact, force) + moment
-        motor_rho = min(max(command[i, 0], -casters[i, LIMIT_DRIVE]), casters[i, LIMIT_DRIVE])
-        motor_phi = min(max(command[i, 1], -casters[i, LIMIT_STEER]), casters[i, LIMIT_STEER])
-        row[MOTOR_RHO], row[MOTOR_PHI] = motor_rho, motor_phi
-        joint_torque[i, 0] = motor_rho + axle @ _cross(contact - arm, force)
-        joint_torque[i, 1] = motor_phi + axis @ (_cross(contact - arm + from_axis, force) + moment)
+        wrench[:3] += force + lean
+        wrench[3:] += _cross(contact, force) + _cross(arm, lean) + moment
+        motor_torques(i, dt, casters[i], command[i], row, effects, at)
+        tau_rho, tau_phi, s_rr, _, s_pp = joint_torques(i, dt, row, normal, effects)
+        tau_rho += axle @ _cross(contact - arm, force)
+        tau_phi += axis @ (_cross(contact - arm + from_axis, force) + _cross(from_axis, lean) + moment)
         # Rotors: back to the definition N^T J N on the joint rates.
         armature = casters[i, J_PP]
-        joint_torque[i, 1] += armature * yaw_acceleration - casters[i, J_RP] * joint_acceleration[i, 0]
-        joint_torque[i, 0] -= casters[i, J_RP] * joint_acceleration[i, 1]
-        wrench[3:] += armature * (yaw_acceleration + joint_acceleration[i, 1]) * axis
-    for k in range(len(effect_place)):
-        i, along = effect_place[k, 0], effect_place[k, 1]
-        torque, slope = joint_effect_torque(
-            effect_kernels[k],
-            wheels[i, RHO + along],
-            wheels[i, RHO_DOT + along],
-            wheels[i, MOTOR_RHO + along],
-            wheels[i, FZ],
-            effect_numbers[k],
+        tau_rho -= casters[i, J_RP] * row[PHI_DDOT]
+        tau_phi += armature * yaw_acceleration - casters[i, J_RP] * row[RHO_DDOT]
+        wrench[3:] += armature * (yaw_acceleration + row[PHI_DDOT]) * axis
+        # The engine steps explicitly: it gets the torque that an implicit step would end with, at rest the very same.
+        tau_rho /= 1.0 + dt * s_rr / _joint_inertia(casters[i], 0)
+        tau_phi /= 1.0 + dt * s_pp / _joint_inertia(casters[i], 1)
+        joint_torque[i, 0], joint_torque[i, 1] = tau_rho, tau_phi
+        turn_motors(
+            i,
+            dt,
+            row[RHO_DOT] + dt * tau_rho / _joint_inertia(casters[i], 0),
+            row[PHI_DOT] + dt * tau_phi / _joint_inertia(casters[i], 1),
+            effects,
         )
-        # The engine steps explicitly: limit the torque to what an implicit step would apply.
-        joint_torque[i, along] += torque / (1.0 + dt * slope / _joint_inertia(casters[i], along))
+    if effects.array_start[-2] < effects.array_start[-1]:
+        com /= total_mass
+        origin = position - rotation @ com_in_base
+        in_base = rotation.T @ (linear_velocity - _cross(angular_velocity, rotation @ com_in_base))
+        chassis_wrench(
+            time,
+            origin[0],
+            origin[1],
+            math.atan2(rotation[1, 0], rotation[0, 0]),
+            in_base[0],
+            in_base[1],
+            angular_velocity[2],
+            com[0],
+            com[1],
+            com[2],
+            effects,
+            at,
+            push,
+        )
+        # From moments about base_link's origin to those about the centre of mass.
+        force = rotation @ push[:3]
+        wrench[:3] += force
+        wrench[3:] += rotation @ push[3:] - _cross(rotation @ com_in_base, force)
     return wrench, joint_torque
