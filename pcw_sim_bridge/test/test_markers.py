@@ -103,6 +103,7 @@ def test_arrows_of_force_load_and_slip_until_the_measurements_end(ros):
         assert (marker.type, marker.action, marker.id) == (Marker.ARROW, Marker.ADD, THESIS.caster_index(caster))
         assert marker.lifetime.sec == 0 and marker.lifetime.nanosec == 250_000_000
         assert marker.color.a > 0.0 and marker.scale.x > 0.0 and marker.pose.orientation.w == 1.0
+        assert 0.0 < marker.scale.z < np.linalg.norm(vector(marker)[1])  # the head ends where the arrow does
     for marker, expected in ((contact, [0.24, -0.32, 0.0]), (load, [0.0, 0.0, 0.8])):
         start, along = vector(marker)
         np.testing.assert_allclose(start, contact_point(THESIS, 1))

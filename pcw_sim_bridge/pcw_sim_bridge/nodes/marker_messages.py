@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
@@ -27,7 +28,9 @@ def arrow_marker(arrow: Arrow, caster: str, number: int, stamp: Time, lifetime: 
     marker = _marker(f"{caster}_fork", arrow.kind, number, Marker.ARROW, arrow.colour, lifetime)
     marker.header.stamp = stamp
     marker.points = [_point(arrow.start), _point(arrow.end)]
-    marker.scale.x, marker.scale.y, marker.scale.z = SHAFT, HEAD, HEAD_LENGTH
+    length = float(np.linalg.norm(arrow.end - arrow.start))
+    # A head longer than its arrow would stick out beyond the end that shows the value.
+    marker.scale.x, marker.scale.y, marker.scale.z = SHAFT, HEAD, min(HEAD_LENGTH, 0.5 * length)
     return marker
 
 
