@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcw_description import DescriptionError, load_robot
@@ -33,6 +33,7 @@ def area(corners):
 sizes, places = st.floats(0.01, 100.0), st.floats(-50.0, 50.0)
 
 
+@settings(deadline=None)  # a busy machine is slow, not wrong
 @given(places, places, sizes, sizes, st.floats(-7.0, 7.0))
 def test_a_rectangle_has_its_area_and_its_corners(x, y, length, width, yaw):
     corners = GroundPatch("ice", x, y, length, width, yaw).outline()
@@ -42,6 +43,7 @@ def test_a_rectangle_has_its_area_and_its_corners(x, y, length, width, yaw):
     np.testing.assert_allclose(np.abs(local), np.broadcast_to([0.5 * length, 0.5 * width], local.shape), atol=1e-11)
 
 
+@settings(deadline=None)  # a busy machine is slow, not wrong
 @given(sizes, sizes, st.floats(-7.0, 7.0))
 def test_an_ellipse_has_the_area_of_its_polygon(length, width, yaw):
     corners = GroundPatch("ice", 0.0, 0.0, length, width, yaw, roundness=1.0).outline()
