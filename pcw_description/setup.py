@@ -42,6 +42,7 @@ setup(
     entry_points={
         "console_scripts": [
             "robot_description = pcw_description.nodes.robot_description:main",
+            "transforms = pcw_description.nodes.transforms:main",
             "urdf = pcw_description.urdf:main",
             "validate = pcw_description.validate:main",
         ],

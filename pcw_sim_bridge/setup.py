@@ -42,6 +42,7 @@ setup(
     entry_points={
         "console_scripts": [
             "bridge = pcw_sim_bridge.nodes.bridge:main",
+            "markers = pcw_sim_bridge.nodes.markers:main",
             "mismatch = pcw_sim_bridge.mismatch.__main__:main",
             "recorder = pcw_sim_bridge.nodes.recorder:main",
         ],

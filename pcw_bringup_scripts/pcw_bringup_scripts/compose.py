@@ -18,9 +18,11 @@ NODES = {
     "bridge": ("pcw_sim_bridge.nodes.bridge", "BridgeNode"),
     "computed_torque": ("pcw_control.nodes.computed_torque", "ComputedTorqueNode"),
     "encoder_slip": ("pcw_estimation.nodes.encoder_slip", "EncoderSlipNode"),
+    "markers": ("pcw_sim_bridge.nodes.markers", "MarkersNode"),
     "odometry": ("pcw_estimation.nodes.odometry", "OdometryNode"),
     "recorder": ("pcw_sim_bridge.nodes.recorder", "RecorderNode"),
     "robot_description": ("pcw_description.nodes.robot_description", "RobotDescriptionNode"),
+    "transforms": ("pcw_description.nodes.transforms", "TransformsNode"),
 }
 
 

@@ -1,7 +1,9 @@
 """Several nodes in one process."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +25,12 @@ def test_every_name_leads_to_a_node():
     for name in NODES:
         [factory] = node_factories([name])
         assert factory.__name__ == NODES[name][1]
+
+
+def test_readme_names_every_node_that_can_be_composed():
+    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    [sentence] = re.findall(r"It composes (.*?), each at most", readme, flags=re.DOTALL)
+    assert re.findall(r"`(\w+)`", sentence) == sorted(NODES)
 
 
 def test_a_whole_robot_drives_and_is_recorded_in_one_process(tmp_path):

@@ -145,6 +145,17 @@ def test_every_executable_has_its_function(package, name, value):
     assert callable(entry.load())
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_executable_stands_in_the_tables_of_the_readmes(package):
+    """In the table of its package by a row of its own, and in the row of its package at the top."""
+    declared = set(re.findall(r'"(\w+) = [\w.]+:main"', (REPOSITORY / package / "setup.py").read_text(encoding="utf-8")))
+    readme = (REPOSITORY / package / "README.md").read_text(encoding="utf-8").partition("## Executables")[2]
+    assert declared - set(re.findall(r"^\| `(\w+)", readme, flags=re.MULTILINE)) == set()
+    top = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    [row] = re.findall(rf"^\| \[{package}\]\(.*$", top, flags=re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", row)) == declared
+
+
 @pytest.mark.parametrize("readme", ["README.md", *(f"{package}/README.md" for package in PACKAGES)])
 def test_what_a_readme_names_is_there(readme):
     """Every `ros2 run PACKAGE EXECUTABLE`, every `./pcw_bringup_scripts/...` command and every linked file."""
