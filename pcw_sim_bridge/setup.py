@@ -44,6 +44,7 @@ setup(
             "bridge = pcw_sim_bridge.nodes.bridge:main",
             "mismatch = pcw_sim_bridge.mismatch.__main__:main",
             "recorder = pcw_sim_bridge.nodes.recorder:main",
+            "simulate = pcw_sim_bridge.simulate:main",
         ],
     },
 )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import zlib
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -72,13 +73,18 @@ class Excitation:
         return sum(duration for duration, _ in self.segments)
 
     def twist(self, time: float) -> FloatArray | None:
-        """Return the twist (3,) wanted at a time since the start [s], zero before and after; None: motors off."""
+        """Return the twist (3,) wanted at a time since the start [s]; None: motors off.
+
+        Zero before and after; motors that are off at the end stay off.
+        """
         if time >= 0.0:
             for duration, twist in self.segments:
                 if time < duration:
                     wanted = twist(time, duration)
                     return None if wanted is None else np.array(wanted)
                 time -= duration
+            if twist(duration, duration) is None:
+                return None
         return np.zeros(3)
 
 
@@ -127,7 +133,7 @@ class _Planner:
         self.spin_speed = min(self.rolling_speed, math.sqrt(reach.acceleration * reach.lever))
         self.curve_yaw_rate = CURVATURE_SHARE * self.curve_speed / self.lever
         self.curve_ramp = (1.0 + CURVATURE_SHARE) * self.curve_speed / self.start_acceleration
-        self.rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng([seed, zlib.crc32(b"excitation")])  # not the numbers of a sensor's noise
 
     def unit(self, axis: int) -> Twist:
         """Return the twist along one axis whose fastest wheel centre moves at 1 m/s."""
@@ -184,18 +190,10 @@ class _Planner:
         return [(duration / 6.0, held(_scaled(self.unit(axis), s), slow)) for axis in range(3) for s in (1.0, -1.0)]
 
     def coast_down(self, duration: float) -> list[Segment]:
-        """Stand, get up to speed in the first half, let roll in the second; once every twenty seconds or so."""
-        rounds = max(1, round(duration / 20.0))
-        part = duration / rounds
-        return [
-            segment
-            for _ in range(rounds)
-            for segment in (
-                (0.1 * part, held((0.0, 0.0, 0.0), lambda t, duration: 1.0)),
-                (0.4 * part, held((1.0, 0.0, 0.0), leg(self.coasting_speed, self.start_acceleration, stop=False))),
-                (0.5 * part, rolling_free),
-            )
-        ]
+        """Get up to speed, hold it for a second where there is time for that, let roll."""
+        driven = min(0.5 * duration, self.coasting_speed / self.start_acceleration + 1.0)
+        faster = leg(self.coasting_speed, self.start_acceleration, stop=False)
+        return [(driven, held((1.0, 0.0, 0.0), faster)), (duration - driven, rolling_free)]
 
     def random_goals(self, duration: float) -> list[Segment]:
         """About ten seconds to each goal, drawn in a box that is small enough for every goal to be reached from any."""

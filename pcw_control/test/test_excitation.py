@@ -9,7 +9,7 @@ import pytest
 
 from pcw_control import ControlError, make_excitation
 from pcw_control.excitation import CHIRP_FREQUENCIES, EXCITATIONS, FIGURE8_ANGLE, LONGEST, SHORTEST
-from pcw_control.motion_range import SPEED_SHARE, MotionRange
+from pcw_control.motion_range import FORCE_SHARE, SPEED_SHARE, MotionRange
 from pcw_description import KinematicsError, load_robot, shipped_robots
 from pcw_description.differential_kinematics import inverse_kinematics
 
@@ -61,16 +61,15 @@ def test_no_joint_is_asked_for_more_than_its_share_of_speed_and_torque(robot, na
     if smooth:
         assert acceleration.max() <= 1.15 * min(MotionRange.of_robot(robot).acceleration, 0.5)
         assert yaw_acceleration.max() <= 1.15 * 1.5
-    inertia = np.diagonal(robot.armature, axis1=1, axis2=2).copy()
-    inertia += [[c.wheel.inertia_axle, c.module.inertia_zz] for c in robot.casters]
+    inertia = robot.armature + [np.diag([c.wheel.inertia_axle, c.module.inertia_zz]) for c in robot.casters]
     lever = np.stack([robot.wheel_radius, np.abs(robot.caster_offset[:, 0])], axis=1)
     wheel_acceleration = np.max(acceleration + MotionRange.of_robot(robot).lever * yaw_acceleration)
     body_torque = robot.total_mass / robot.n * lever * wheel_acceleration
     speeds = joint_speeds(robot, twist, np.where(np.arange(robot.n) % 2, 0.0, 3.1), step)
     assert (np.abs(speeds) / robot.speed_limit).max() <= SPEED_SHARE * 1.01
     if smooth:
-        joint_torque = np.abs(np.diff(speeds, axis=0)).max(axis=0) / step * inertia
-        assert ((joint_torque + body_torque) / robot.torque_limit).max() < 0.7
+        joint_torque = np.abs(np.einsum("nij,tnj->tni", inertia, np.diff(speeds, axis=0) / step))
+        assert ((joint_torque + body_torque) / robot.torque_limit).max() < 2.0 * FORCE_SHARE
 
 
 @pytest.mark.parametrize("name", EXCITATIONS)
@@ -78,11 +77,11 @@ def test_begins_and_ends_at_rest(name):
     excitation = make_excitation(name, THESIS)
     assert excitation.name == name and excitation.summary.endswith(".")
     assert excitation.duration == pytest.approx(EXCITATIONS[name].duration)
-    assert not excitation.twist(-0.1).any() and not excitation.twist(excitation.duration + 0.1).any()
+    assert not excitation.twist(-0.1).any()
     if name not in ("identification", "holdout", "steps"):  # these begin with what the controller has to soften
         assert np.abs(excitation.twist(1e-6)).max() < 1e-3
-    last = excitation.twist(excitation.duration - 1e-6)
-    assert last is None if name == "coast_down" else np.abs(last).max() < 1e-3
+    for last in (excitation.twist(excitation.duration - 1e-6), excitation.twist(excitation.duration + 0.1)):
+        assert last is None if name == "coast_down" else np.abs(last).max() < 1e-3
     assert excitation.lifted == (name == "wheels_off_ground")
 
 
@@ -127,12 +126,15 @@ def test_chirps_sweep_from_the_first_to_the_last_frequency(name, axis, parts):
             assert np.abs(piece[:, other]).max() > 0.05 and not np.delete(piece, other, axis=1).any()
 
 
-def test_coast_down_gets_up_to_speed_and_lets_go():
-    excitation = make_excitation("coast_down", THESIS, 20.0)
-    off = [t for t in np.arange(0.0, 20.0, 0.01) if excitation.twist(t) is None]
-    assert off[0] == pytest.approx(10.0, abs=0.02) and off[-1] > 19.9
-    assert excitation.twist(9.99)[0] == pytest.approx(1.2, rel=0.01)
-    assert np.isnan(twists(make_excitation("coast_down", THESIS, 60.0), 0.1)).any(axis=1).sum() == pytest.approx(300, abs=3)
+def test_coast_down_gets_up_to_speed_and_lets_go_for_good():
+    excitation = make_excitation("coast_down", THESIS, 40.0)
+    instants = np.arange(0.0, 41.0, 0.01)
+    off = np.array([excitation.twist(t) is None for t in instants])
+    first = instants[off.argmax()]
+    assert 5.0 < first < 15.0 and off[off.argmax() :].all()
+    assert excitation.twist(first - 0.02)[0] == pytest.approx(1.2)
+    hurried = make_excitation("coast_down", THESIS, 10.0)
+    assert hurried.twist(5.0) is None and 0.3 < hurried.twist(4.99)[0] < 1.2
 
 
 def test_a_seed_draws_the_goals():
