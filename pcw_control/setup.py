@@ -36,7 +36,7 @@ setup(
     maintainer_email="pcw-maintainers@example.org",
     description=(
         "Controllers for powered-caster robots: computed torque with the pseudo-inverse, quintic "
-        "trajectories and torque limits."
+        "trajectories, torque limits and excitations."
     ),
     license="Apache-2.0",
     entry_points={

@@ -45,6 +45,7 @@ setup(
             "markers = pcw_sim_bridge.nodes.markers:main",
             "mismatch = pcw_sim_bridge.mismatch.__main__:main",
             "recorder = pcw_sim_bridge.nodes.recorder:main",
+            "simulate = pcw_sim_bridge.simulate:main",
         ],
     },
 )

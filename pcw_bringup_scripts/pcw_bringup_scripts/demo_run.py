@@ -36,13 +36,13 @@ from pcw_control import (
     computed_torque,
     limit_torque,
 )
+from pcw_control.excitation import SHORTEST
 from pcw_description import AugmentedObjectModel, RobotDescription, load_robot, odometry, save_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.errors import PcwError
 from pcw_estimation import encoder_slip
 from pcw_sim_bridge.plants.factory import make_plant
 
-from .manoeuvres import SHORTEST
 from .supervised_processes import Child, Children, ProcessError
 
 EFFECT = "drive_coulomb_friction"
@@ -204,7 +204,7 @@ def record(name: str, duration: float, out: Path, robot_commands: Sequence[tuple
                 sys.executable, "-m", "pcw_bringup_scripts.nodes.manoeuvre", "--ros-args",
                 *_parameter_arguments(
                     {
-                        "manoeuvre": name, "duration": duration,
+                        "manoeuvre": name, "robot": str(out / "robot.yaml"), "duration": duration,
                         "wait_for": ["computed_torque", "odometry", "encoder_slip", "recorder"],
                     }
                 ),

@@ -1,4 +1,4 @@
-"""Controllers for powered-caster robots: computed torque, quintic trajectories and torque limits."""
+"""Controllers for powered-caster robots: computed torque, quintic trajectories, torque limits; excitations."""
 
 from .computed_torque import (
     ComputedTorque,
@@ -9,6 +9,8 @@ from .computed_torque import (
     TwistReference,
 )
 from .errors import ControlError
+from .excitation import EXCITATIONS, Excitation, make_excitation
+from .motion_range import MotionRange
 from .quintic_trajectory import MotionLimits, QuinticTrajectory, TrajectoryPoint, plan_point_to_point
 from .torque_limits import LimitedTorque, TorqueLimits, limit_torque
 
@@ -19,12 +21,16 @@ __all__ = [
     "ComputedTorqueParameters",
     "ComputedTorqueState",
     "ControlError",
+    "EXCITATIONS",
+    "Excitation",
     "LimitedTorque",
     "MotionLimits",
+    "MotionRange",
     "QuinticTrajectory",
     "TorqueLimits",
     "TrajectoryPoint",
     "TwistReference",
     "limit_torque",
+    "make_excitation",
     "plan_point_to_point",
 ]

@@ -87,6 +87,19 @@ _Loader.add_implicit_resolver(
 )
 
 
+def parse_yaml(content: str, key: str, origin: str) -> object:
+    """Read YAML; an error names `key` and where the text comes from.
+
+    Raises:
+        DescriptionError: the text is not YAML.
+    """
+    try:
+        return yaml.load(content, Loader=_Loader)  # noqa: S506 - a SafeLoader
+    except yaml.YAMLError as error:
+        problem = " ".join(str(error).split())
+        raise DescriptionError(key, origin, f"it is not YAML ({problem}); allowed: valid YAML") from None
+
+
 def load_yaml_mapping(path: str | Path) -> dict[str, Any]:
     """Load one YAML file that holds a mapping.
 
@@ -95,14 +108,11 @@ def load_yaml_mapping(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # noqa: S506 - a SafeLoader
+        content = parse_yaml(path.read_text(encoding="utf-8"), "file", str(path))
     except OSError as error:
         raise DescriptionError("file", str(path), f"{error.strerror or error}; allowed: a readable YAML file") from None
     except UnicodeDecodeError:
         raise DescriptionError("file", str(path), "it is not text; allowed: a YAML file") from None
-    except yaml.YAMLError as error:
-        problem = " ".join(str(error).split())
-        raise DescriptionError("file", str(path), f"it is not YAML ({problem}); allowed: valid YAML") from None
     if not isinstance(content, dict):
         found = "nothing" if content is None else f"one {type(content).__name__}"
         raise DescriptionError("file", str(path), f"it holds {found}; allowed: a mapping of keys to values")

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 
 from .description_fields import document
-from .effects.registry import all_effects
+from .effects.registry import effects_text
 from .errors import PcwError
 from .robot_description import DEFAULT_TOLERANCES, RobotDescription
 from .robot_file import load_robot, shipped_robots
@@ -30,17 +30,6 @@ def keys_table() -> str:
 def tolerances_table() -> str:
     """Return the names under `tolerances:` with their defaults as a Markdown table."""
     return _table(("tolerance", "default"), [(name, str(value)) for name, value in DEFAULT_TOLERANCES.items()])
-
-
-def effects_table() -> str:
-    """Return the effects known under `physics:` as a Markdown table."""
-    rows = []
-    for effect in all_effects().values():
-        parameters = ", ".join(
-            f"{p.name} [{p.unit}]" + ("" if p.default is None else f" = {p.default:g}") for p in effect.parameters
-        )
-        rows.append((effect.name, effect.target_kind, parameters, effect.summary))
-    return _table(("effect", "target", "parameters", "meaning"), rows)
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -77,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (options.robots or options.keys or options.effects):
         parser.error("nothing to do: name a robot, or use --keys or --effects")
     tables = [keys_table(), tolerances_table()] if options.keys else []
-    tables += [effects_table()] if options.effects else []
+    tables += [effects_text()] if options.effects else []
     if tables:
         print("\n\n".join(tables))
     return check(options.robots)

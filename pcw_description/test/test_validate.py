@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from pcw_description.description_fields import document, quantity, section, text
-from pcw_description.effects.registry import all_effects
+from pcw_description.effects.registry import all_effects, effects_text
 from pcw_description.robot_description import DEFAULT_TOLERANCES
 from pcw_description.robot_file import load_robot, robot_to_mapping, robots_directory, shipped_robots
-from pcw_description.validate import effects_table, keys_table, main, tolerances_table
+from pcw_description.validate import keys_table, main, tolerances_table
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -97,9 +97,9 @@ def test_tables_of_tolerances_and_effects_are_complete() -> None:
     for name, tolerance in DEFAULT_TOLERANCES.items():
         assert f"| {name} | {tolerance} |" in tolerances_table()
     for effect in all_effects().values():
-        assert f"| {effect.name} | {effect.target_kind} |" in effects_table()
+        assert f"{effect.name} ({effect.target_kind}" in effects_text()
         for parameter in effect.parameters:
-            assert f"{parameter.name} [{parameter.unit}]" in effects_table()
+            assert f"{parameter.name} [{parameter.unit}]" in effects_text()
 
 
 def test_documentation_follows_from_the_declaration() -> None:

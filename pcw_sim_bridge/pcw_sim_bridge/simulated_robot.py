@@ -209,22 +209,24 @@ class SimulatedRobot:
         if self.steps == target:
             yield from self._samples_now()
             return
-        torque = self._torque()
+        if self.timed_out:
+            self._loops.reset()
+        command = None if self.timed_out else self._command
         while self.steps < target:
             halt = min(target, *(schedule.next_step for schedule in self._schedules()))
-            self.plant.step(torque, halt - self.steps)
-            self.steps = halt
+            self._drive(command, halt)
             yield from self._samples_now()
 
-    def _torque(self) -> FloatArray:
-        command = self._command
-        if command is None or self.timed_out:
-            self._loops.reset()
-            return np.zeros((self.robot.n, 2))
-        if command.effort is not None:
-            return command.effort
-        assert command.velocity is not None
-        return self._loops.torque(command.velocity, self.plant.state().motor_velocity, self.control_period)
+    def _drive(self, command: JointCommand | None, halt: int) -> None:
+        """Advance the plant to the step `halt` under a command; None is zero torque."""
+        if command is not None and command.velocity is not None:
+            for _ in range(halt - self.steps):  # the drives' own loops are faster than joint_states: as fast as the plant
+                torque = self._loops.torque(command.velocity, self.plant.state().motor_velocity, self.plant.dt)
+                self.plant.step(torque)
+        else:
+            effort = None if command is None else command.effort
+            self.plant.step(np.zeros((self.robot.n, 2)) if effort is None else effort, halt - self.steps)
+        self.steps = halt
 
     def close(self) -> None:
         """Free what the plant holds."""

@@ -1,28 +1,22 @@
-"""A recording without a running graph: a simulated robot and a computed-torque controller in one loop, in simulated time."""
+"""A recording without a running graph: a simulated robot and a controller in one loop, in simulated time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import numpy as np
-
-from pcw_control.computed_torque import (
-    ComputedTorque,
-    ComputedTorqueMeasurement,
-    TwistReference,
-    initial_state,
-)
-from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.recording_writer import RecordingWriter
 from pcw_description.robot_description import FloatArray, RobotDescription
 from pcw_description.ros_messages import imu, joint_state, odometry, twist_stamped
 
 from .plants.factory import make_plant
+from .run_controllers import make_controller
 from .sensors import ImuReading, JointReading
 from .simulated_robot import JointCommand, Sample, SimulatedRobot, TrackedPose
+from .stamping import StampingParameters, TopicStamps
 
-CommandedTwist = Callable[[float], FloatArray]
+CommandedTwist = Callable[[float], FloatArray | None]
 # A stamp of zero means "no stamp" in ROS, so recordings begin at one second [ns].
 START_NS = 1_000_000_000
 
@@ -35,56 +29,97 @@ def record_run(
     path: str | Path,
     plant_name: str = "reduced",
     controlled_as: RobotDescription | None = None,
-) -> None:
+    controller_name: str = "computed_torque",
+    stamping: StampingParameters | None = None,
+    lifted: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Mapping[str, int]:
     """Drive a robot along a commanded twist and write the recording that a real one would have left.
+
+    A run that does not come to its end leaves no folder: its seed repeats it, and a part of it would read as a whole.
 
     Args:
         robot: the robot as it really is; its `physics` are at work.
-        commanded_twist: time [s] -> twist (3,) of base_link.
+        commanded_twist: time [s] -> twist (3,) of base_link; None: motors off, and no cmd_vel.
         duration: [s].
-        seed: of all sensor noise; the same seed gives the same bytes of data.
+        seed: of all noise; the same seed gives the same bytes of data.
         path: folder of the recording, which must not exist.
         plant_name: see `make_plant`.
         controlled_as: the robot that the controller believes in; default: `robot`.
+        controller_name: see `make_controller`.
+        stamping: of what is recorded; default: exact, and nothing lost. The controller is on board and loses nothing.
+        lifted: the robot is jacked up, its wheels off the ground.
+        progress: called with the simulated time [s] after each control period.
+
+    Returns:
+        Number of messages by topic.
 
     Raises:
-        RecordingError: `path` exists.
-        PlantError: the plant cannot be made.
+        RecordingError: `path` exists or cannot be written.
+        PlantError: the plant or the controller cannot be made, or the plant leaves what it can compute.
     """
-    believed = controlled_as or robot
-    simulated = SimulatedRobot(make_plant(plant_name, robot), seed)
-    controller, state = ComputedTorque(believed), initial_state()
-    limits = TorqueLimits.of_robot(believed)
-    torque, saturated = np.zeros((robot.n, 2)), False
+    simulated = SimulatedRobot(make_plant(plant_name, robot, lifted=lifted), seed)
     try:
-        with RecordingWriter(path, flush_interval=None) as writer:
-            while simulated.time_ns < duration * 1e9:
-                for sample in simulated.advance():
-                    _write(writer, robot, sample)
-                    if not isinstance(sample.reading, JointReading):
-                        continue
-                    joints = sample.reading
-                    target = commanded_twist(sample.time_ns * 1e-9)
-                    measurement = ComputedTorqueMeasurement(joints.position, joints.velocity, np.zeros(3), saturated)
-                    dt = simulated.control_period
-                    state, wanted = controller.step(state, measurement, TwistReference(target), dt)
-                    limited = limit_torque(limits, torque, wanted.torque, joints.velocity, dt)
-                    torque, saturated = limited.torque, limited.saturated
-                    simulated.command(JointCommand(effort=torque))
-                    stamp = sample.time_ns + START_NS
-                    writer.write("/cmd_vel", twist_stamped(stamp, target))
-                    writer.write("/joint_commands", joint_state(stamp, robot.joint_names, effort=torque))
+        controller = make_controller(controller_name, controlled_as or robot)
+        writer = RecordingWriter(path, flush_interval=None)
+        try:
+            with writer:
+                recorder = _Recorder(writer, robot, TopicStamps(stamping or StampingParameters(), seed, robot))
+                while simulated.time_ns < duration * 1e9:
+                    for sample in simulated.advance():
+                        recorder.sample(sample)
+                        if not isinstance(sample.reading, JointReading):
+                            continue
+                        twist = commanded_twist(sample.time_ns * 1e-9)
+                        command = controller.command(sample.reading, twist, simulated.control_period)
+                        simulated.command(command)
+                        recorder.answer(sample.time_ns, twist, command)
+                    if progress is not None:
+                        progress(simulated.time_ns * 1e-9)
+        except BaseException:
+            shutil.rmtree(writer.path)
+            raise
+        return writer.counts
     finally:
         simulated.close()
 
 
-def _write(writer: RecordingWriter, robot: RobotDescription, sample: Sample) -> None:
-    """Write one reading on its topic; contact forces stay with the simulator, as on a real robot."""
-    stamp, reading = sample.time_ns + START_NS, sample.reading
-    if isinstance(reading, JointReading):
-        message = joint_state(stamp, robot.joint_names, reading.position, reading.velocity, reading.effort)
-        writer.write("/joint_states", message)
-    elif isinstance(reading, ImuReading):
-        writer.write("/imu/data", imu(stamp, reading.angular_velocity, reading.linear_acceleration))
-    elif isinstance(reading, TrackedPose):
-        writer.write("/ground_truth/odom", odometry(stamp, reading.pose, reading.truth.twist))
+class _Recorder:
+    """Writes what a robot and its controller send, as it is stamped and as far as it is not lost."""
+
+    def __init__(self, writer: RecordingWriter, robot: RobotDescription, stamps: TopicStamps) -> None:
+        self._writer, self._joint_names, self._stamps = writer, robot.joint_names, stamps
+        self._joint_stamp_ns = 0
+
+    def sample(self, sample: Sample) -> None:
+        """Write one reading on its topic; contact forces stay with the simulator, as on a real robot."""
+        now, reading = sample.time_ns + START_NS, sample.reading
+        if isinstance(reading, JointReading):
+            self._joint_stamp_ns, lost = self._stamps.stamp("joint_states", now)
+            if not lost:
+                message = joint_state(
+                    self._joint_stamp_ns, self._joint_names, reading.position, reading.velocity, reading.effort
+                )
+                self._writer.write("/joint_states", message, now)
+        elif isinstance(reading, ImuReading):
+            stamp, lost = self._stamps.stamp("imu/data", now)
+            if not lost:
+                self._writer.write("/imu/data", imu(stamp, reading.angular_velocity, reading.linear_acceleration), now)
+        elif isinstance(reading, TrackedPose):
+            stamp, lost = self._stamps.stamp("ground_truth/odom", now)
+            if not lost:
+                self._writer.write("/ground_truth/odom", odometry(stamp, reading.pose, reading.truth.twist), now)
+
+    def answer(self, time_ns: int, twist: FloatArray | None, command: JointCommand) -> None:
+        """Write what was wanted and the command, which bears the stamp of the joint_states that it answers."""
+        now = time_ns + START_NS
+        if twist is not None:
+            stamp, lost = self._stamps.stamp("cmd_vel", now)
+            if not lost:
+                self._writer.write("/cmd_vel", twist_stamped(stamp, twist), now)
+        _, lost = self._stamps.stamp("joint_commands", now)
+        if not lost:
+            message = joint_state(
+                self._joint_stamp_ns, self._joint_names, velocity=command.velocity, effort=command.effort
+            )
+            self._writer.write("/joint_commands", message, now)

@@ -150,10 +150,11 @@ def test_velocity_commands_turn_the_wheels(ros):
     )
 
 
-def run_in_lockstep(seed, lateness):
-    """Readings of 300 control periods against a commander that takes its time."""
+def run_in_lockstep(seed, lateness, *parameters):
+    """Stamps and readings of 300 control periods against a commander that takes its time."""
     with RosTest() as ros:
-        ros.start(BRIDGE, "-p", "lockstep:=true", "-p", "real_time_factor:=0.0", "-p", f"seed:={seed}")
+        more = [argument for parameter in parameters for argument in ("-p", parameter)]
+        ros.start(BRIDGE, "-p", "lockstep:=true", "-p", "real_time_factor:=0.0", "-p", f"seed:={seed}", *more)
         states = []
         publisher = ros.peer.create_publisher(JointState, "joint_commands", 10)
 
@@ -167,15 +168,29 @@ def run_in_lockstep(seed, lateness):
 
         ros.peer.create_subscription(JointState, "joint_states", answer, 1000)
         ros.wait_for(lambda: len(states) >= 300)
-        assert stamps(states[:300]) == [k * PERIOD_NS for k in range(300)]
-        return np.array([[*s.position, *s.velocity, *s.effort] for s in states[:300]])
+        return np.array(stamps(states[:300])), np.array([[*s.position, *s.velocity, *s.effort] for s in states[:300]])
 
 
 def test_lockstep_gives_the_same_result_bit_by_bit_however_long_the_answers_take():
-    prompt, late = run_in_lockstep(5, 0.0), run_in_lockstep(5, 0.004)
+    (stamp, prompt), (_, late) = run_in_lockstep(5, 0.0), run_in_lockstep(5, 0.004)
+    np.testing.assert_array_equal(stamp, np.arange(300) * PERIOD_NS)
     np.testing.assert_array_equal(prompt, late)
     assert np.abs(prompt[-1, 0]) > 1e-3  # it did move
-    assert not np.array_equal(prompt, run_in_lockstep(6, 0.0))
+    assert not np.array_equal(prompt, run_in_lockstep(6, 0.0)[1])
+
+
+def test_lockstep_holds_with_jittered_stamps_and_lost_messages():
+    """A stamp before its time is still answered, and a joint_states that nobody got is not waited for: either would cost the
+    lockstep_timeout each time.
+    """
+    parameters = ("stamp_jitter:=0.0003", "loss:=0.2", "lockstep_timeout:=60.0")
+    (stamp, prompt), (late_stamp, late) = run_in_lockstep(5, 0.0, *parameters), run_in_lockstep(5, 0.004, *parameters)
+    np.testing.assert_array_equal(stamp, late_stamp)
+    np.testing.assert_array_equal(prompt, late)
+    assert np.all(np.diff(stamp) > 0)
+    periods = np.round(stamp / PERIOD_NS).astype(int)
+    assert np.std(stamp - periods * PERIOD_NS) == pytest.approx(0.0003e9, rel=0.2)
+    assert 0.05 < 1.0 - len(periods) / (periods[-1] + 1) < 0.4
 
 
 def test_lockstep_waits_for_a_controller_and_survives_its_end(ros):

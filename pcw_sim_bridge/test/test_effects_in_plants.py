@@ -13,11 +13,13 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.augmented_object_model import AugmentedObjectModel
 from pcw_description.effects.registry import all_effects, read_physics
+from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import PlantError
-from pcw_sim_bridge.simulated_robot import SimulatedRobot
 from pcw_sim_bridge.sensors import ImuReading, JointReading
+from pcw_sim_bridge.simulated_robot import SimulatedRobot
+from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
 # No steer/drive coupling, equal wheels: what one joint does is not hidden by another.
@@ -762,3 +764,21 @@ def test_an_eccentric_encoder_swings_around_the_angle(plant_name):
     reported = np.array([reading.position for _, reading in pairs])[:, 0, DRIVE]
     rates = np.array([reading.velocity for _, reading in pairs])[:, 0, DRIVE]
     np.testing.assert_allclose(np.gradient(reported, 0.002)[2:-2], rates[2:-2], rtol=0.01, atol=0.02)
+
+
+def test_stamps_of_another_clock_are_shifted_and_nothing_else(plant_name, tmp_path):
+    """A recorded run with shifted clocks has the same readings, each topic's stamps off by its clock."""
+    recordings = []
+    for name, physics in (
+        ("plain", []),
+        ("shifted", [{"name": "clock_offset", "offset": 0.0125, "tracker_offset": -0.05}]),
+    ):
+        robot = dataclasses.replace(THESIS, physics=read_physics(physics, THESIS.caster_names))
+        record_run(robot, lambda t: np.array([0.3, 0.0, 0.5 * t]), 0.5, 3, tmp_path / name, plant_name)
+        recordings.append(Recording.read(tmp_path / name, THESIS))
+    plain, shifted = recordings
+    np.testing.assert_allclose(shifted.imu.stamp - plain.imu.stamp, 0.0125, atol=1e-6)
+    np.testing.assert_allclose(shifted.ground_truth.stamp - plain.ground_truth.stamp, -0.05, atol=1e-6)
+    np.testing.assert_array_equal(shifted.joint_states.stamp, plain.joint_states.stamp)
+    np.testing.assert_array_equal(shifted.joint_states.position, plain.joint_states.position)
+    np.testing.assert_array_equal(shifted.imu.angular_velocity, plain.imu.angular_velocity)

@@ -1,4 +1,4 @@
-"""Drives a manoeuvre by cmd_vel in simulated time, once everybody who shall see it is there."""
+"""Drives an excitation of pcw_control by cmd_vel in simulated time, once everybody who shall see it is there."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
+from pcw_control.excitation import EXCITATIONS, make_excitation
 from pcw_description.errors import PcwError
 from pcw_description.nodes.node_tools import COMMAND_SOURCE, SENSOR, declare, run_node, stamp_to_ns
-
-from ..manoeuvres import MANOEUVRES
+from pcw_description.robot_file import load_robot
 
 # What has to be heard by a node of `wait_for` before the simulation starts, if the node listens to it at all.
 PROGRESS_PERIOD = 2.0  # real time between two lines on the progress [s]
@@ -32,14 +32,16 @@ class ManoeuvreNode(Node):
 
     def __init__(self) -> None:
         super().__init__("manoeuvre")
-        name = declare(self, "manoeuvre", "identification", "which one", read_only=True, choices=tuple(MANOEUVRES))
+        name = declare(self, "manoeuvre", "identification", "which one", read_only=True, choices=tuple(EXCITATIONS))
+        robot = declare(self, "robot", "thesis", "to measure for whom: robot file, or shipped robot", read_only=True)
+        seed = declare(self, "seed", 0, "of what the manoeuvre draws", range=(0, 2**31 - 1), read_only=True)
         duration = declare(self, "duration", 0.0, "length; 0 is its own", "s", (0.0, 3600.0), read_only=True)
         rate = declare(self, "rate", 50.0, "rate of cmd_vel, simulated time", "Hz", (1.0, 1000.0), read_only=True)
         self._wait_for = declare(self, "wait_for", Parameter.Type.STRING_ARRAY, "nodes that must listen first", read_only=True)
         self._patience = declare(
             self, "patience", 60.0, "give up after so long in vain, real time", "s", (1.0, 3600.0), read_only=True
         )
-        self._manoeuvre = MANOEUVRES[name] if duration == 0.0 else MANOEUVRES[name].lasting(duration)
+        self._manoeuvre = make_excitation(name, load_robot(robot), duration or None, seed)
         self._period_ns = round(1e9 / rate)
         self._start_ns: int | None = None
         self._next_ns = 0
@@ -88,11 +90,12 @@ class ManoeuvreNode(Node):
         if self._heard - self._told > PROGRESS_PERIOD:
             self._told = self._heard
             self.get_logger().info(f"progress {elapsed:.1f} of {self._manoeuvre.duration:.1f} s")
-        command = self._command
-        command.header.stamp = message.clock
         twist = self._manoeuvre.twist(elapsed)
-        command.twist.linear.x, command.twist.linear.y, command.twist.angular.z = twist.tolist()
-        self._cmd_vel.publish(command)
+        if twist is not None:  # else the motors shall be off, which a controller does that no longer hears of cmd_vel
+            command = self._command
+            command.header.stamp = message.clock
+            command.twist.linear.x, command.twist.linear.y, command.twist.angular.z = twist.tolist()
+            self._cmd_vel.publish(command)
         if elapsed >= self._manoeuvre.duration:
             self._phase = "stopping"
             self._answer = self._pause.call_async(SetBool.Request(data=True))

@@ -56,6 +56,20 @@ def get(name: str) -> Effect:
     return effects[name]
 
 
+def effects_text() -> str:
+    """Return all effects as text: name, target, what it is, who sees it, what it is taken for, and each parameter."""
+    blocks = []
+    for effect in all_effects().values():
+        joints = f", axis {' or '.join(effect.axes)} (default {effect.axis})" if effect.axes else ""
+        lines = [f"{effect.name} ({effect.target_kind}{joints}): {effect.summary}"]
+        lines.append(f"    seen by {', '.join(effect.sensors)}; easily taken for {', '.join(effect.look_alikes)}")
+        for p in effect.parameters:
+            default = "must be given" if p.default is None else f"default {p.default:g}"
+            lines.append(f"    {p.name} [{p.unit}]: {p.help}; {p.lower:g} to {p.upper:g}, {default}, typical {p.typical:g}")
+        blocks.append("\n".join(lines))
+    return "\n".join(blocks)
+
+
 def read_physics(entries: object, caster_names: Sequence[str]) -> tuple[EffectInstance, ...]:
     """Read the `physics:` list of a description.
 

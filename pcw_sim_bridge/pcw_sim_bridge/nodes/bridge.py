@@ -19,6 +19,7 @@ from ..plants.factory import make_plant
 from ..plants.plant import PLANT_NAMES, PlantError
 from ..sensors import VELOCITY_SOURCES
 from ..simulated_robot import JointCommand, SimulatedRobot
+from ..stamping import LARGEST_JITTER, LARGEST_LOSS, StampingParameters, TopicStamps
 from .bridge_messages import BridgePublishers
 
 # As fast as possible means this much work between two looks at the executor [s].
@@ -32,7 +33,8 @@ class BridgeNode(Node):
 
     A refused command (NaN, both or none of effort and velocity, other joints) is zero torque until the next good one.
     With `lockstep` the simulation waits after each joint_states for a joint_commands with at least its stamp, so that
-    a controller in another process gives the same result however long it takes.
+    a controller in another process gives the same result however long it takes. A joint_states that is lost is not waited for:
+    nobody can answer it.
     """
 
     def __init__(self) -> None:
@@ -48,6 +50,10 @@ class BridgeNode(Node):
         bandwidth = declare(
             self, "velocity_bandwidth", 30.0, "bandwidth of the drives' velocity loops", "rad/s", (1.0, 300.0), read_only=True
         )
+        jitter = declare(
+            self, "stamp_jitter", 0.0, "standard deviation of the stamps", "s", (0.0, LARGEST_JITTER), read_only=True
+        )
+        loss = declare(self, "loss", 0.0, "fraction of the messages lost, in bursts", "1", (0.0, LARGEST_LOSS), read_only=True)
         timeout = declare(self, "command_timeout", 0.1, "zero torque after so long without a command", "s", (0.002, 10.0))
         declare(self, "real_time_factor", 1.0, "simulated per real time; 0 is as fast as possible", "1", (0.0, 1000.0))
         declare(self, "lockstep", False, "wait for a command after each joint_states", read_only=True)
@@ -64,7 +70,7 @@ class BridgeNode(Node):
             list(self._simulated.advance())
         self._simulated.reset()
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
-        self._outputs = BridgePublishers(self, robot, clock_rate)
+        self._outputs = BridgePublishers(self, robot, clock_rate, TopicStamps(StampingParameters(jitter, loss), seed, robot))
         self.create_subscription(JointState, "joint_commands", self._on_command, COMMAND)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -144,7 +150,7 @@ class BridgeNode(Node):
             self.get_logger().error(f"the simulation stands still: {error}")
             self._diagnostics.report()
         self._begun = True
-        self._answered = False
+        self._answered = self._outputs.joint_states_lost
         self._last_published = time.monotonic()
 
     # --- Commands ---------------------------------------------------------------------------------------
@@ -157,7 +163,7 @@ class BridgeNode(Node):
             self._refused_commands += 1
             if self._problems.add(f"{error}; the torque is zero"):
                 self._diagnostics.report()
-        if self._lockstep and stamp_to_ns(message.header.stamp) >= self._simulated.time_ns:
+        if self._lockstep and stamp_to_ns(message.header.stamp) >= self._outputs.joint_states_stamp_ns:
             self._answered = True
             self._go_on()
 
@@ -183,6 +189,7 @@ class BridgeNode(Node):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._simulated.reset()
+        self._outputs.reset()
         self._fault, self._begun = "", False
         self._reported = (time.monotonic(), 0)
         self._anchor()

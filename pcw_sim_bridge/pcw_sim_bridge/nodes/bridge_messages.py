@@ -17,12 +17,22 @@ from pcw_description.robot_description import LATERAL, LONGITUDINAL, RobotDescri
 from ..plants.plant import PlantState
 from ..sensors import ImuReading, JointReading
 from ..simulated_robot import NANOSECONDS, Sample, TrackedPose
+from ..stamping import TopicStamps
 
 
 class BridgePublishers:
-    """The bridge's publishers and their messages, made once and filled again and again."""
+    """The bridge's publishers and their messages, made once and filled again and again.
 
-    def __init__(self, node: Node, robot: RobotDescription, clock_rate: float) -> None:
+    What a robot sends has the stamps and losses of `stamps`; /clock and the contact forces are the simulator's own.
+
+    Attributes:
+        joint_states_stamp_ns: stamp of the newest joint_states [ns].
+        joint_states_lost: whether it was lost.
+    """
+
+    def __init__(self, node: Node, robot: RobotDescription, clock_rate: float, stamps: TopicStamps) -> None:
+        self._stamps = stamps
+        self.joint_states_stamp_ns, self.joint_states_lost = 0, False
         self._clock_period_ns, self._next_clock_ns = round(NANOSECONDS / clock_rate), 0
         self._clock = node.create_publisher(Clock, "/clock", 1)
         self.joint_states = node.create_publisher(JointState, "joint_states", SENSOR_STREAM_SOURCE)
@@ -41,25 +51,40 @@ class BridgePublishers:
 
     def publish(self, sample: Sample) -> None:
         """Publish one reading; the joints are preceded by /clock where that is due, so that whoever answers knows the time."""
-        stamp, reading = ns_to_stamp(sample.time_ns), sample.reading
+        reading = sample.reading
         if isinstance(reading, JointReading):
             self._publish_clock(sample.time_ns)
-            self._joint_message.header.stamp = stamp
+            self._publish_joints(sample.time_ns, reading)
+        elif isinstance(reading, ImuReading) and self._imu is not None:
+            self._publish_imu(sample.time_ns, reading)
+        elif isinstance(reading, TrackedPose):
+            self._publish_truth(sample.time_ns, reading)
+        elif isinstance(reading, PlantState):
+            self._publish_contacts(ns_to_stamp(sample.time_ns), reading)
+
+    def reset(self) -> None:
+        """Begin anew at time zero."""
+        self._stamps.reset()
+
+    def _publish_joints(self, time_ns: int, reading: JointReading) -> None:
+        self.joint_states_stamp_ns, self.joint_states_lost = self._stamps.stamp("joint_states", time_ns)
+        if not self.joint_states_lost:
+            self._joint_message.header.stamp = ns_to_stamp(self.joint_states_stamp_ns)
             fill_joint_state(self._joint_message, reading.position, reading.velocity, reading.effort)
             self.joint_states.publish(self._joint_message)
-        elif isinstance(reading, ImuReading) and self._imu is not None:
-            message = self._imu_message
-            message.header.stamp = stamp
-            for vector, values in (
-                (message.angular_velocity, reading.angular_velocity),
-                (message.linear_acceleration, reading.linear_acceleration),
-            ):
-                vector.x, vector.y, vector.z = values.tolist()
-            self._imu.publish(message)
-        elif isinstance(reading, TrackedPose):
-            self._publish_truth(stamp, reading)
-        elif isinstance(reading, PlantState):
-            self._publish_contacts(stamp, reading)
+
+    def _publish_imu(self, time_ns: int, reading: ImuReading) -> None:
+        stamp_ns, lost = self._stamps.stamp("imu/data", time_ns)
+        if lost:
+            return
+        message = self._imu_message
+        message.header.stamp = ns_to_stamp(stamp_ns)
+        for vector, values in (
+            (message.angular_velocity, reading.angular_velocity),
+            (message.linear_acceleration, reading.linear_acceleration),
+        ):
+            vector.x, vector.y, vector.z = values.tolist()
+        self._imu.publish(message)
 
     def _publish_clock(self, time_ns: int) -> None:
         if time_ns < self._next_clock_ns - self._clock_period_ns:
@@ -68,9 +93,12 @@ class BridgePublishers:
             self._next_clock_ns = time_ns - time_ns % self._clock_period_ns + self._clock_period_ns
             self._clock.publish(Clock(clock=ns_to_stamp(time_ns)))
 
-    def _publish_truth(self, stamp, reading: TrackedPose) -> None:  # noqa: ANN001
+    def _publish_truth(self, time_ns: int, reading: TrackedPose) -> None:
+        stamp_ns, lost = self._stamps.stamp("ground_truth/odom", time_ns)
+        if lost:
+            return
         message = self._truth_message
-        message.header.stamp = stamp
+        message.header.stamp = ns_to_stamp(stamp_ns)
         pose, twist = message.pose.pose, message.twist.twist
         x, y, yaw = reading.pose.tolist()
         pose.position.x, pose.position.y = x, y
