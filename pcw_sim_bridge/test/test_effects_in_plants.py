@@ -380,7 +380,7 @@ def test_a_loaded_tyre_rolls_on_a_smaller_radius(plant_name):
 
 @pytest.mark.parametrize("error", [-0.075, -0.2])
 def test_a_radius_of_nothing_is_refused(plant_name, error):
-    with pytest.raises(PlantError, match=r"physics\[0\]: wheel_radius_error (leaves a wheel without|makes a robot that cannot)"):
+    with pytest.raises(PlantError, match=r"physics\[0\]: wheel_radius_error (leaves a wheel|makes a robot that)"):
         Rig(plant_name, {"name": "wheel_radius_error", "error": error})
 
 
@@ -513,7 +513,9 @@ def test_on_a_patch_friction_is_less_and_beside_it_is_not(plant_name):
     patch = {"name": "low_friction_patch", "factor": 0.4, "x": x, "y": y, "length": 0.3, "width": 0.1, "roundness": 0.0}
     strong = dataclasses.replace(
         THESIS,
-        casters=tuple(dataclasses.replace(c, limits=dataclasses.replace(c.limits, drive_torque=100.0)) for c in THESIS.casters),
+        casters=tuple(
+            dataclasses.replace(c, limits=dataclasses.replace(c.limits, drive_torque=100.0)) for c in THESIS.casters
+        ),
     )
     with Rig(plant_name, patch, robot=strong) as rig:
         # Just above what each wheel can hold, so that it passes its peak slowly; two pull against two.
@@ -694,7 +696,9 @@ def readings(plant_name, *entries, kind, seconds=0.3):
     sensors = THESIS.sensors
     quiet = dataclasses.replace(
         sensors,
-        encoders=dataclasses.replace(sensors.encoders, velocity_noise=0.0, torque_noise=0.0, drive_counts=1e7, steer_counts=1e7),
+        encoders=dataclasses.replace(
+            sensors.encoders, velocity_noise=0.0, torque_noise=0.0, drive_counts=1e7, steer_counts=1e7
+        ),
         imu=dataclasses.replace(sensors.imu, gyro_noise=0.0, accelerometer_noise=0.0),
     )
     robot = dataclasses.replace(THESIS, sensors=quiet)
@@ -775,7 +779,7 @@ def test_stamps_of_another_clock_are_shifted_and_nothing_else(plant_name, tmp_pa
     ):
         robot = dataclasses.replace(THESIS, physics=read_physics(physics, THESIS.caster_names))
         record_run(robot, lambda t: np.array([0.3, 0.0, 0.5 * t]), 0.5, 3, tmp_path / name, plant_name)
-        recordings.append(Recording.read(tmp_path / name, THESIS))
+        recordings.append(Recording.open(tmp_path / name, THESIS))
     plain, shifted = recordings
     np.testing.assert_allclose(shifted.imu.stamp - plain.imu.stamp, 0.0125, atol=1e-6)
     np.testing.assert_allclose(shifted.ground_truth.stamp - plain.ground_truth.stamp, -0.05, atol=1e-6)

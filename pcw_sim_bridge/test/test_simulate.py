@@ -185,10 +185,12 @@ def test_lists_every_effect_with_its_parameters_and_every_excitation(capsys):
     assert simulate.main(["--list-effects"]) == 0
     text = capsys.readouterr().out
     for effect in all_effects().values():
-        block = text.partition(f"{effect.name} ({effect.target_kind}): {effect.summary}\n")[2]
-        for parameter, line in zip(effect.parameters, block.splitlines()):
+        axes = f", axis {' or '.join(effect.axes)} (default {effect.axis})" if effect.axes else ""
+        block = text.partition(f"{effect.name} ({effect.target_kind}{axes}): {effect.summary}\n")[2]
+        assert all(name in block.splitlines()[0] for name in (*effect.sensors, *effect.look_alikes))
+        for parameter, line in zip(effect.parameters, block.splitlines()[1:]):
             default = "must be given" if parameter.default is None else f"default {parameter.default:g}"
-            expected = f"{parameter.lower:g} to {parameter.upper:g}, {default}"
+            expected = f"{parameter.lower:g} to {parameter.upper:g}, {default}, typical {parameter.typical:g}"
             assert line == f"    {parameter.name} [{parameter.unit}]: {parameter.help}; {expected}"
     assert simulate.main(["--list-excitations"]) == 0
     lines = capsys.readouterr().out.splitlines()
