@@ -50,6 +50,28 @@ def test_lets_the_bridge_run_drives_in_its_time_and_pauses_it_again():
         assert stamps == sorted(stamps) and {c.header.frame_id for c in commands} == {"base_link"}
 
 
+def test_falls_silent_where_the_motors_shall_be_off():
+    with RosTest() as ros:
+        bridge, commands = PlayedBridge(ros), ros.listen(TwistStamped, "cmd_vel")
+        node = ros.start(NODE, "-p", "manoeuvre:=coast_down", "-p", "duration:=10.0")
+        ros.wait_for(lambda: node.process.poll() is not None, while_doing=bridge.tick, every=0.001)
+        assert node.wait() == 0
+        assert bridge.asked == [False, True] and bridge.time_ns > 9.9e9
+        last = commands[-1]
+        assert 4.5e9 < stamp_to_ns(last.header.stamp) < 5.5e9 and last.twist.linear.x > 0.3
+
+
+@pytest.mark.parametrize(
+    ("parameter", "complaint"),
+    [("duration:=5.0", "allowed: 10 to 3600 s"), ("manoeuvre:=figure9", "figure8"), ("robot:=thesos", "'thesis'?")],
+)
+def test_what_cannot_be_driven_ends_it_with_one_line(parameter, complaint):
+    with RosTest() as ros:
+        node = ros.start(NODE, "-p", parameter)
+        assert node.wait() == 2
+        assert complaint in node.log and "Traceback" not in node.log
+
+
 def test_waits_for_who_shall_listen_and_gives_up_with_their_names():
     with RosTest() as ros:
         bridge = PlayedBridge(ros)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
@@ -101,10 +102,11 @@ class ManoeuvreNode(Node):
             self._answer = self._pause.call_async(SetBool.Request(data=True))
 
     def close(self) -> None:
-        """Leave the robot with a command to stand."""
+        """Leave the robot with a command to stand, once it has arrived."""
         if self._phase == "driving":
             self._command.twist = Twist()
             self._cmd_vel.publish(self._command)
+            self._cmd_vel.wait_for_all_acked(Duration(seconds=0.2))  # else it is lost now and then as the node goes
 
 
 def main(args: Sequence[str] | None = None) -> int:
