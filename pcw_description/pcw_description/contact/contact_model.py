@@ -91,6 +91,16 @@ def friction_coefficient(tyre, longitudinal_slip, lateral_slip):  # type: ignore
 
 
 @compiled
+def slip_under_load(z, load_before, load):  # type: ignore[no-untyped-def]
+    """Return the relaxed slip z [m] of a tyre whose load changed since the step before [N].
+
+    The rubber that more load brings to the ground is not sheared yet: the force stays, spread over more of it. So a tyre
+    gains no energy by being loaded, and lands without a force. Less load takes its part of the force with it.
+    """
+    return z * (load_before / load) if load > load_before else z
+
+
+@compiled
 def tyre_step_with_slopes(tyre, z_x, z_y, slip_x, slip_y, speed, normal_force, dt):  # type: ignore[no-untyped-def]
     """Advance one tyre by dt.
 

@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import scrub_torque, tyre_step_with_slopes
+from pcw_description.contact.contact_model import scrub_torque, slip_under_load, tyre_step_with_slopes
 from pcw_description.effects.kinds import (
     CONTACT_RESULTS,
     FORCE_INPUTS,
@@ -182,7 +182,14 @@ def _advance(  # type: ignore[no-untyped-def]
             tyre = casters[i, TYRE:]
             grip = normal[i] * ground[i, FRICTION]
             zx, zy, fx, fy, row[_DZ_X], row[_DZ_Y], gx, gy = tyre_step_with_slopes(
-                tyre, wheel[ZX], wheel[ZY], slip_x, slip_y, speed, grip, dt
+                tyre,
+                slip_under_load(wheel[ZX], wheel[FZ], normal[i]),
+                slip_under_load(wheel[ZY], wheel[FZ], normal[i]),
+                slip_x,
+                slip_y,
+                speed,
+                grip,
+                dt,
             )
             spin = scrub_torque(tyre, sigma, speed, grip)
             wheel[ZX], wheel[ZY], wheel[FX], wheel[FY], wheel[FZ] = zx, zy, fx, fy, normal[i]

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import scrub_torque, tyre_step
+from pcw_description.contact.contact_model import scrub_torque, slip_under_load, tyre_step
 from pcw_description.effects.kinds import (
     CONTACT_RESULTS,
     FORCE_INPUTS,
@@ -192,7 +192,14 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         tyre = casters[i, TYRE:]
         grip = normal * ground[FRICTION]
         row[ZX], row[ZY], force_x, force_y = tyre_step(
-            tyre, row[ZX], row[ZY], slip_x, slip_y, speed, grip, dt
+            tyre,
+            slip_under_load(row[ZX], row[FZ], normal),
+            slip_under_load(row[ZY], row[FZ], normal),
+            slip_x,
+            slip_y,
+            speed,
+            grip,
+            dt,
         )
         spin = scrub_torque(tyre, turning[2], speed, grip)
         row[SLIP_X], row[SLIP_Y], row[FX], row[FY], row[FZ] = slip_x, slip_y, force_x, force_y, normal
