@@ -32,6 +32,7 @@ from pcw_control.computed_torque import (
 )
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.augmented_object_model import AugmentedObjectModel
+from pcw_description.effects.registry import all_effects, read_physics
 from pcw_description.errors import PcwError
 from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
@@ -46,6 +47,7 @@ FORMAT = "pcw_benchmark/1"
 STEP = 1e-3  # of the plants [s]
 MICROSECONDS, REAL_TIME = "us", "x real time"
 LIBRARIES = ("numpy", "scipy", "numba", "pybullet")
+Prepare = Callable[[RobotDescription], Callable[[], float]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Task:
     name: str
     unit: str
     target: float | None
-    prepare: Callable[[RobotDescription], Callable[[], float]]
+    prepare: Prepare
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +114,7 @@ def measure(task: Task, robot: RobotDescription, repeats: int) -> Result:
     return Result(task.name, task.unit, task.target, best, statistics.median(figures), first)
 
 
-def odometry_update(method: str) -> Callable[[RobotDescription], Callable[[], float]]:
+def odometry_update(method: str) -> Prepare:
     """Forward kinematics and odometry with its covariance, on joint angles that move and are noisy."""
 
     def prepare(robot: RobotDescription) -> Callable[[], float]:
@@ -151,6 +153,19 @@ def augmented_object(robot: RobotDescription) -> Callable[[], float]:
     return work
 
 
+def with_all_effects(prepare: Prepare) -> Prepare:
+    """The same task with every effect of the vocabulary at work, at its typical size, on all casters."""
+
+    def prepare_with_effects(robot: RobotDescription) -> Callable[[], float]:
+        entries = [
+            {"name": effect.name, **{p.name: p.typical for p in effect.parameters if p.default is None}}
+            for effect in all_effects().values()
+        ]
+        return prepare(dataclasses.replace(robot, physics=read_physics(entries, robot.caster_names)))
+
+    return prepare_with_effects
+
+
 def to_and_fro(plant: Plant) -> np.ndarray:
     """Return drive torques (n, 2) that push the robot to and fro when their sign changes, a fifth of what it can."""
     torque = np.zeros((plant.robot.n, 2))
@@ -172,7 +187,7 @@ def reduced_in_batch(robot: RobotDescription) -> Callable[[], float]:
     return work
 
 
-def reduced_stepped(read: bool) -> Callable[[RobotDescription], Callable[[], float]]:
+def reduced_stepped(read: bool) -> Prepare:
     """The reduced plant step by step from Python; with `read`, its state is read after every step as well."""
 
     def prepare(robot: RobotDescription) -> Callable[[], float]:
@@ -192,7 +207,7 @@ def reduced_stepped(read: bool) -> Callable[[RobotDescription], Callable[[], flo
     return prepare
 
 
-def with_controller(plant_name: str, seconds: float) -> Callable[[RobotDescription], Callable[[], float]]:
+def with_controller(plant_name: str, seconds: float) -> Prepare:
     """Follow a turning twist in closed loop: plant, state, sensors, odometry, computed torque, torque limits."""
 
     def prepare(robot: RobotDescription) -> Callable[[], float]:
@@ -237,8 +252,10 @@ TASKS = (
     Task("reduced plant at 1 ms, in batch", REAL_TIME, 800.0, reduced_in_batch),
     Task("reduced plant at 1 ms, stepped from Python", REAL_TIME, 200.0, reduced_stepped(read=False)),
     Task("the same, its state read after each step", REAL_TIME, None, reduced_stepped(read=True)),
+    Task("the same in batch, all effects at work", REAL_TIME, 300.0, with_all_effects(reduced_in_batch)),
     Task("reduced plant with sensors and controller", REAL_TIME, None, with_controller("reduced", 1.0)),
     Task("PyBullet plant with sensors and controller", REAL_TIME, 8.0, with_controller("pybullet", 1.0)),
+    Task("the same, all effects at work", REAL_TIME, 6.0, with_all_effects(with_controller("pybullet", 1.0))),
 )
 
 

@@ -57,9 +57,10 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--out", type=Path, metavar="BAG", help="folder to make; one that exists is left as it is")
     options.add_argument("--plant", default="reduced", metavar="NAME", help=f"{', '.join(PLANT_NAMES)} (default: reduced)")
     options.add_argument(
-        "--controller", default="computed_torque", metavar="NAME",
+        "--controller", metavar="NAME",
         help="computed_torque, or velocity_loops: inverse kinematics and the drives' own velocity loops, a simple robot; "
-        "neither knows of the robot's physics: effects (default: computed_torque)",
+        "neither knows of the robot's physics: effects (default: computed_torque; with the wheels off the ground "
+        "velocity_loops, as no twist moves a robot on a jack)",
     )
     options.add_argument(
         "--physics", action="append", default=[], metavar="FILE_OR_YAML",
@@ -112,7 +113,7 @@ def _check(command_line: argparse.ArgumentParser, options: argparse.Namespace) -
         command_line.error(f"--seed {options.seed} is not allowed; allowed: 0 and above")
     for name, known in (("plant", PLANT_NAMES), ("controller", CONTROLLER_NAMES)):
         value = getattr(options, name)
-        if value not in known:
+        if value not in (None, *known):
             command_line.error(f"--{name} {value!r} is not allowed; {nearest_name(value, known)}")
     if options.ideal and (options.stamp_jitter, options.loss) != (None, None):
         command_line.error("--ideal with --stamp-jitter or --loss is not allowed; allowed: one or the other")
@@ -129,6 +130,9 @@ def run(options: argparse.Namespace) -> None:
     robot = dataclasses.replace(nominal, physics=(*nominal.physics, *added))
     believed = dataclasses.replace(nominal, physics=())
     excitation = make_excitation(options.excite, believed, options.duration, options.seed)
+    controller = options.controller or ("velocity_loops" if excitation.lifted else "computed_torque")
+    if excitation.lifted and controller != "velocity_loops":
+        raise DescriptionError("controller", controller, f"allowed: velocity_loops with {options.excite}, off the ground")
     if options.ideal:
         stamping = StampingParameters()
     else:
@@ -141,7 +145,7 @@ def run(options: argparse.Namespace) -> None:
     try:
         counts = record_run(
             robot, excitation.twist, excitation.duration, options.seed, options.out, options.plant,
-            controlled_as=believed, controller_name=options.controller, stamping=stamping, lifted=excitation.lifted,
+            controlled_as=believed, controller_name=controller, stamping=stamping, lifted=excitation.lifted,
             progress=progress,
         )
     finally:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from pcw_description.compiled import COMPILES, array_kernel_list, joint_torque_list
+from pcw_description.compiled import COMPILES, array_kernel_list, compiled, joint_torque_list
 from pcw_description.effects.kinds import (
     MEMORY,
     ActuatorEffect,
@@ -96,15 +96,12 @@ class EffectTables:
 
     def motor_motion(self, joint_position: FloatArray, joint_velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return angles and rates of the motors (n, 2) as the joint motion that rigid gears would give them."""
-        motions = []
-        for joint, column in ((joint_position, ANGLE), (joint_velocity, RATE)):
-            if self.has_gears:
-                rigid = np.einsum("nij,nj->ni", self.coupling, joint)
-                motor = np.where(self.gears[:, :, GEAR] > 0.0, self.gear_state[:, :, column], rigid)
-                motions.append(np.linalg.solve(self.coupling, motor[:, :, None])[:, :, 0])
-            else:
-                motions.append(joint.copy())
-        return motions[0], motions[1]
+        if not self.has_gears:
+            return joint_position.copy(), joint_velocity.copy()
+        return (
+            _as_joint_motion(self.gears, self.coupling, self.gear_state[:, :, ANGLE], joint_position),
+            _as_joint_motion(self.gears, self.coupling, self.gear_state[:, :, RATE], joint_velocity),
+        )
 
     def _collect_joint_torques(self, robot: RobotDescription) -> None:
         kernels, place, numbers, start = [], [], [], [0]
@@ -163,6 +160,20 @@ class EffectTables:
                 else:
                     row[:] = 1.0, rotor, gear.stiffness, gear.damping, gear.play
         self.has_gears = bool(self.gears[:, :, GEAR].any())
+
+
+@compiled
+def _as_joint_motion(gears, coupling, motor, joint):  # type: ignore[no-untyped-def]
+    """Return the joint angles or rates (n, 2) that rigid gears would have with these motors behind the gears that are not."""
+    found = np.empty_like(joint)
+    for i in range(len(joint)):
+        e01, e10 = coupling[i, 0, 1], coupling[i, 1, 0]
+        drive = motor[i, 0] if gears[i, 0, GEAR] > 0.0 else joint[i, 0] + e01 * joint[i, 1]
+        steer = motor[i, 1] if gears[i, 1, GEAR] > 0.0 else e10 * joint[i, 0] + joint[i, 1]
+        determinant = 1.0 - e01 * e10
+        found[i, 0] = (drive - e01 * steer) / determinant
+        found[i, 1] = (steer - e10 * drive) / determinant
+    return found
 
 
 def _depends_on_speed(effect: JointTorqueEffect, values: FloatArray) -> bool:
