@@ -43,6 +43,7 @@ class BridgeNode(Node):
         plant = declare(self, "plant", "reduced", "what computes the motion", read_only=True, choices=PLANT_NAMES)
         dt = declare(self, "dt", 0.001, "step of the plant", "s", (1e-4, 5e-3), read_only=True)
         seed = declare(self, "seed", 0, "seed of the sensor noise", range=(0, 2**31 - 1), read_only=True)
+        lifted = declare(self, "lifted", False, "the robot is on a jack, its wheels off the ground", read_only=True)
         gui = declare(self, "gui", False, "show the plant's window (pybullet)", read_only=True)
         source = declare(
             self, "velocity_source", "drive", "where measured joint speeds come from", read_only=True, choices=VELOCITY_SOURCES
@@ -65,7 +66,7 @@ class BridgeNode(Node):
         declare(self, "start_paused", False, "wait for ~/pause with false, or ~/step", read_only=True)
 
         self.robot = robot
-        self._simulated = SimulatedRobot(make_plant(plant, robot, dt, gui), seed, source, timeout, bandwidth)
+        self._simulated = SimulatedRobot(make_plant(plant, robot, dt, gui, lifted), seed, source, timeout, bandwidth)
         for _ in range(3):  # compiles everything before the clock starts
             list(self._simulated.advance())
         self._simulated.reset()
