@@ -42,7 +42,9 @@ def compiled(function: Function) -> Function:
     """Compile `function` to machine code, cached on disk; a division by zero gives inf or nan, as in numpy."""
     if not NUMBA_AVAILABLE:
         return function
-    dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+    # What was typed into an interpreter has no file, and the cache no place.
+    in_file = Path(function.__code__.co_filename).is_file()
+    dispatcher = numba.njit(cache=in_file, error_model="numpy")(function)
     _depend_on_all_kernels(dispatcher, function.__module__)
     return dispatcher  # type: ignore[no-any-return]
 
