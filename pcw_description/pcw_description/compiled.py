@@ -29,10 +29,10 @@ except ImportError:  # pragma: no cover - exercised on machines without numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Signature of every joint-torque kernel: (position [rad], velocity [rad/s], motor_torque [N m],
-# normal_force [N], parameters) -> torque [N m]. One signature lets a compiled plant call any list of effects
-# through function pointers, so that adding an effect does not compile the plant again.
-JOINT_TORQUE_SIGNATURE = "float64(float64, float64, float64, float64, float64[::1])"
+# Signature of every joint-torque kernel: (position [rad], velocity [rad/s], motor_torque [N m], normal_force [N],
+# parameters) -> torque [N m] and minus its slope over velocity [N m s/rad]. One signature lets a compiled plant call any
+# list of effects through function pointers, so that adding an effect does not compile the plant again.
+JOINT_TORQUE_SIGNATURE = "UniTuple(float64, 2)(float64, float64, float64, float64, float64[::1])"
 # Signature of every other kernel: (at, parameters, result), what they hold being a matter of the effect's kind. One
 # signature for all, because each further list of kernels costs a plant's step more than its arithmetic.
 ARRAY_SIGNATURE = "void(float64[::1], float64[::1], float64[::1])"
@@ -90,7 +90,7 @@ def _kernels_digest(folder: str) -> str:
     return digest.hexdigest()
 
 
-def joint_torque_list(functions: Sequence[Callable[..., float]]) -> Any:
+def joint_torque_list(functions: Sequence[Callable[..., tuple[float, float]]]) -> Any:
     """A list of joint-torque kernels that compiled code can call, empty lists included."""
     return _kernel_list(JOINT_TORQUE_SIGNATURE, functions)
 
@@ -116,7 +116,7 @@ def joint_torque_along(kernels, position, velocity, motor_torque, normal_force, 
     kernel = kernels[0]
     torque = position.copy()
     for index in range(len(position)):
-        torque[index] = kernel(
+        torque[index], _ = kernel(
             position[index], velocity[index], motor_torque[index], normal_force[index], parameters
         )
     return torque

@@ -142,6 +142,19 @@ def test_regressor_is_the_derivative_of_the_contribution(effect: JointTorqueEffe
 
 
 @each_joint_effect
+def test_slope_is_the_derivative_over_velocity(effect: JointTorqueEffect) -> None:
+    """What the kernel returns beside its torque, against central differences, on both sides of every sign change."""
+    position, velocity, motor_torque, normal_force = motion()
+    numbers = effect.values(typical(effect) | {p.name: 0.3 * p.typical for p in effect.parameters if p.linear})
+    step = 1e-7
+    for at in zip(position, velocity[velocity != 0.0], motor_torque, normal_force):
+        _, slope = effect.torque(*at, numbers)
+        above, below = (effect.torque(at[0], at[1] + sign * step, *at[2:], numbers)[0] for sign in (1.0, -1.0))
+        scale = abs(slope) + abs(above) + 1e-3
+        assert slope == pytest.approx(-(above - below) / (2.0 * step), abs=1e-5 * scale), at
+
+
+@each_joint_effect
 def test_contribution_is_finite_even_far_out(effect: JointTorqueEffect) -> None:
     extreme = np.array([-1e6, -1.0, 0.0, 1.0, 1e6])
     zero = np.zeros(5)

@@ -153,7 +153,7 @@ REFUSED = [
     (["--excite", "circle", "--physics", "{name: drive_coulomb_friction}"], "physics[0].coulomb is missing; allowed: 0 to"),
     (["--excite", "circle", "--physics", "{name: drive_coulomb_friction, coulomb: -1}"], "physics[0].coulomb: -1 is not"),
     (["--excite", "circle", "--physics", "{name: drive_coulomb_friction, target: [front], coulomb: 1}"], "target: 'front'"),
-    (["--excite", "circle", "--physics", "{name: actuator_lag, axis: steering, time_constant: 0.01}"], "allowed: drive, steer"),
+    (["--excite", "circle", "--physics", "{name: actuator_lag, axis: front, time_constant: 0.1}"], "allowed: drive, steer"),
     (["--excite", "circle", "--physics", "{name: payload_mass, axis: drive, mass: 1}"], "no axis for payload_mass"),
     (["--excite", "circle", "--physics", "{name: wheel_radius_error, error: -0.2}"], "leaves a wheel without a radius"),
     (["--excite", "circle", "--physics", "{name: [}"], "it is not YAML"),

@@ -20,7 +20,7 @@ from pcw_description.effects.kinds import JointTorqueEffect
 
 @compiled_joint_torque
 def spring(position, velocity, motor_torque, normal_force, parameters):
-    return -parameters[0] * position
+    return -parameters[0] * position, 0.0
 
 
 EFFECT = JointTorqueEffect(

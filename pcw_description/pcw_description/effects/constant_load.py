@@ -6,9 +6,9 @@ from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def constant_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def constant_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return -load: positive loads must be overcome when moving forwards [N m]."""
-    return -parameters[0]
+    return -parameters[0], 0.0
 
 
 EFFECT = JointTorqueEffect(

@@ -3,16 +3,18 @@
 import math
 
 from ..compiled import compiled_joint_torque
-from .drive_coulomb_friction import SMOOTHING_SPEED
+from .drive_coulomb_friction import SMOOTHING_SPEED, smooth_sign
 from .effect import EffectParameter
 from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def stribeck_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def stribeck_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return -stribeck exp(-(v / stribeck_speed)^2) sgn(v), with a smoothed sign [N m]."""
     ratio = velocity / parameters[1]
-    return -parameters[0] * math.exp(-ratio * ratio) * math.tanh(velocity / parameters[2])
+    sign = smooth_sign(velocity, parameters[2])
+    level = parameters[0] * math.exp(-ratio * ratio)
+    return -level * sign, level * ((1.0 - sign * sign) / parameters[2] - 2.0 * ratio * sign / parameters[1])
 
 
 EFFECT = JointTorqueEffect(

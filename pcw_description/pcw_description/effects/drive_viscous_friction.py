@@ -6,9 +6,10 @@ from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def viscous_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def viscous_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return -(viscous v + asymmetry |v|) [N m]."""
-    return -(parameters[0] * velocity + parameters[1] * abs(velocity))
+    slope = parameters[0] + (parameters[1] if velocity >= 0.0 else -parameters[1])
+    return -(parameters[0] * velocity + parameters[1] * abs(velocity)), slope
 
 
 EFFECT = JointTorqueEffect(

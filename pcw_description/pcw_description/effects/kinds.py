@@ -70,12 +70,13 @@ class JointTorqueEffect(Effect):
 
     Attributes:
         torque: compiled kernel (position [rad], velocity [rad/s], motor_torque [N m], normal_force [N],
-            parameters (len(self.parameters),)) -> torque [N m]; on a linear bench axis m, m/s and N instead.
+            parameters (len(self.parameters),)) -> torque [N m] and minus its slope over velocity [N m s/rad], by which
+            plants take friction implicitly; on a linear bench axis m, m/s and N instead.
         motor_side: it acts on the motor, before a gear that plays or twists; position and velocity are the motor's,
             joint side.
     """
 
-    torque: Callable[..., float] = dataclasses.field(default=lambda *_: 0.0, repr=False)
+    torque: Callable[..., tuple[float, float]] = dataclasses.field(default=lambda *_: (0.0, 0.0), repr=False)
     motor_side: bool = False
 
     def contribution(

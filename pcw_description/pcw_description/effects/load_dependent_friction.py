@@ -1,18 +1,17 @@
 """Friction of a gear that grows with the torque it transmits, as in gears."""
 
-import math
-
 from ..compiled import compiled_joint_torque
 from ..robot_description import AXIS_NAMES
-from .drive_coulomb_friction import SMOOTHING_SPEED
+from .drive_coulomb_friction import SMOOTHING_SPEED, smooth_sign
 from .effect import EffectParameter
 from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def load_friction_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def load_friction_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return -fraction |motor_torque| sgn(v), with a smoothed sign [N m]."""
-    return -parameters[0] * abs(motor_torque) * math.tanh(velocity / parameters[1])
+    sign, level = smooth_sign(velocity, parameters[1]), parameters[0] * abs(motor_torque)
+    return -level * sign, level * (1.0 - sign * sign) / parameters[1]
 
 
 EFFECT = JointTorqueEffect(

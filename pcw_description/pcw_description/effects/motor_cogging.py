@@ -9,10 +9,10 @@ from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def cogging_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def cogging_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return cosine cos(k q) + sine sin(k q), k periods per radian of the joint [N m]."""
     angle = parameters[2] * position
-    return parameters[0] * math.cos(angle) + parameters[1] * math.sin(angle)
+    return parameters[0] * math.cos(angle) + parameters[1] * math.sin(angle), 0.0
 
 
 EFFECT = JointTorqueEffect(

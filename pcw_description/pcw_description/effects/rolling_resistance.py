@@ -1,17 +1,16 @@
 """Rolling resistance of the tyre: a torque proportional to the load on the wheel, against rolling."""
 
-import math
-
 from ..compiled import compiled_joint_torque
-from .drive_coulomb_friction import SMOOTHING_SPEED
+from .drive_coulomb_friction import SMOOTHING_SPEED, smooth_sign
 from .effect import EffectParameter
 from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def rolling_resistance_torque(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def rolling_resistance_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return -arm F_z sgn(v), with a smoothed sign [N m]."""
-    return -parameters[0] * normal_force * math.tanh(velocity / parameters[1])
+    sign, level = smooth_sign(velocity, parameters[1]), parameters[0] * normal_force
+    return -level * sign, level * (1.0 - sign * sign) / parameters[1]
 
 
 EFFECT = JointTorqueEffect(

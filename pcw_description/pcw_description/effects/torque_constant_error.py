@@ -7,9 +7,9 @@ from .kinds import JointTorqueEffect
 
 
 @compiled_joint_torque
-def torque_gain_error(position: float, velocity: float, motor_torque: float, normal_force: float, parameters) -> float:  # type: ignore[no-untyped-def]
+def torque_gain_error(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
     """Return error * motor_torque [N m]."""
-    return parameters[0] * motor_torque
+    return parameters[0] * motor_torque, 0.0
 
 
 EFFECT = JointTorqueEffect(

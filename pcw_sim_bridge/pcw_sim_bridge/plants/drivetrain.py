@@ -27,9 +27,6 @@ from .effect_tables import (
     TORQUE_AT_REST,
 )
 
-# Step of the slope of a friction law [rad/s]: far below any smoothing speed, far above rounding.
-_SLOPE_STEP = 1e-6
-
 
 @compiled
 def motor_torques(i, dt, caster, command, wheel, effects, at):  # type: ignore[no-untyped-def]
@@ -55,16 +52,6 @@ def motor_torques(i, dt, caster, command, wheel, effects, at):  # type: ignore[n
 
 
 @compiled
-def _torque_and_slope(kernel, place, position, velocity, motor_torque, normal_force, numbers):  # type: ignore[no-untyped-def]
-    """Return a torque [N m] and minus its slope over speed, at least zero [N m s/rad]."""
-    torque = kernel(position, velocity, motor_torque, normal_force, numbers)
-    if place[2] == 0:
-        return torque, 0.0
-    ahead = kernel(position, velocity + _SLOPE_STEP, motor_torque, normal_force, numbers)
-    return torque, max((torque - ahead) / _SLOPE_STEP, 0.0)
-
-
-@compiled
 def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def]
     """Return the torques of motors, gears and friction on (rho, phi) of caster i, and minus their slopes.
 
@@ -81,9 +68,7 @@ def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def
         place = effects.joint_place[k]
         axis = place[0]
         if place[1] == 1 and gears[i, axis, GEAR] > 0.0:
-            torque, slope = _torque_and_slope(
-                kernels[k],
-                place,
+            torque, slope = kernels[k](
                 gear_state[i, axis, ANGLE] + 0.5 * dt * gear_state[i, axis, RATE],
                 gear_state[i, axis, RATE],
                 wheel[MOTOR_RHO + axis],
@@ -92,14 +77,12 @@ def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def
             )
             if axis == 0:
                 on_motor_0 += torque
-                motor_slope_0 += slope
+                motor_slope_0 += max(slope, 0.0)
             else:
                 on_motor_1 += torque
-                motor_slope_1 += slope
+                motor_slope_1 += max(slope, 0.0)
             continue
-        torque, slope = _torque_and_slope(
-            kernels[k],
-            place,
+        torque, slope = kernels[k](
             wheel[RHO + axis] + 0.5 * dt * wheel[RHO_DOT + axis],
             wheel[RHO_DOT + axis],
             wheel[MOTOR_RHO + axis],
@@ -108,10 +91,10 @@ def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def
         )
         if axis == 0:
             tau_rho += torque
-            s_rr += slope
+            s_rr += max(slope, 0.0)
         else:
             tau_phi += torque
-            s_pp += slope
+            s_pp += max(slope, 0.0)
     if gears[i, 0, GEAR] == 0.0 and gears[i, 1, GEAR] == 0.0:
         return tau_rho + wheel[MOTOR_RHO], tau_phi + wheel[MOTOR_PHI], s_rr, s_rp, s_pp
     # Torques of the motors, each on its own shaft, joint side: tau = E^T u with the rows E of the coupling.

@@ -55,7 +55,7 @@ class EffectTables:
 
     Attributes:
         joint_kernels: compiled joint torques, those of caster i from joint_start[i] to joint_start[i + 1].
-        joint_place: axis, 1 for the motor's side, and 1 if the torque depends on speed, (m, 3).
+        joint_place: axis, and 1 for the motor's side, (m, 2).
         joint_numbers: parameters of each, padded with zeros, (m, widest).
         array_kernels: compiled kernels of the other kinds, in the order contacts by caster, actuators by joint, forces.
         array_start: first kernel of caster 0 .. n - 1, of joint 0 .. 2n - 1, of the forces, and the end, (3n + 2,).
@@ -110,14 +110,12 @@ class EffectTables:
                 effect = get(instance.name)
                 if isinstance(effect, JointTorqueEffect) and caster in instance.target:
                     kernels.append(effect.torque)
-                    values = effect.values(instance.parameters)
-                    axis = AXIS_NAMES.index(instance.axis or effect.axis)
-                    place.append((axis, int(effect.motor_side), int(_depends_on_speed(effect, values))))
-                    numbers.append(values)
+                    place.append((AXIS_NAMES.index(instance.axis or effect.axis), int(effect.motor_side)))
+                    numbers.append(effect.values(instance.parameters))
             start.append(len(kernels))
         self.joint_kernels = joint_torque_list(kernels)
         self.joint_start = np.array(start, dtype=np.int64)
-        self.joint_place = np.array(place, dtype=np.int64).reshape(-1, 3)
+        self.joint_place = np.array(place, dtype=np.int64).reshape(-1, 2)
         self.joint_numbers = _padded(numbers)
 
     def _collect_arrays(self, robot: RobotDescription, dt: float) -> None:
@@ -174,12 +172,6 @@ def _as_joint_motion(gears, coupling, motor, joint):  # type: ignore[no-untyped-
         found[i, 0] = (drive - e01 * steer) / determinant
         found[i, 1] = (steer - e10 * drive) / determinant
     return found
-
-
-def _depends_on_speed(effect: JointTorqueEffect, values: FloatArray) -> bool:
-    """Whether the torque differs between speeds; the slope of one that does not is zero, and need not be computed."""
-    torques = {effect.torque(0.3, speed, 1.0, 100.0, values) for speed in (-30.0, -1.0, -1e-3, 0.0, 1e-2, 0.5, 20.0)}
-    return len(torques) > 1
 
 
 def _contacts(robot: RobotDescription, caster: str) -> Iterable[Entry]:
