@@ -132,7 +132,7 @@ def test_stands_still_without_torque_and_resets_where_asked() -> None:
 def test_two_casters_cannot_stand() -> None:
     """The error says what to use instead; NaN torque is refused."""
     robot = load_robot("thesis")
-    with pytest.raises(PlantError, match="has 2 casters; the PyBullet plant needs at least 3"):
+    with pytest.raises(PlantError, match="has 2 casters; a plant in space needs at least 3"):
         make_plant("pybullet", dataclasses.replace(robot, casters=robot.casters[:2]))
     plant = make_plant("pybullet", robot)
     with pytest.raises(PlantError, match="NaN"):
