@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -37,9 +39,12 @@ class BulletEngine:
     """
 
     def __init__(self, robot: RobotDescription, gravity: FloatArray, dt: float, gui: bool, held: bool) -> None:
+        # Where no display is, Bullet would end the process.
+        if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            raise PlantError("PyBullet could not start its window; is a display there?")
         self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self._client < 0:
-            raise PlantError("PyBullet could not start" + (" its window; is a display there?" if gui else ""))
+            raise PlantError("PyBullet could not start")
         self.body_rotors = np.array(robot.armature)
         self._load(robot, gravity, dt, held)
 

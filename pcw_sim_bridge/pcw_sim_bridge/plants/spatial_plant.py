@@ -229,12 +229,15 @@ class SpatialPlant:
         """Advance by `steps` steps of dt with motor torques (n, 2) [N m] held.
 
         Raises:
-            PlantError: a torque is NaN or infinite; the plant has not moved.
+            PlantError: a torque is NaN or infinite, and the plant has not moved; or its state has left all bounds, and only
+                `reset` brings it back.
         """
         if not np.isfinite(motor_torque).all():
             raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
         for _ in range(steps):
             self._single_step(motor_torque)
+        if not (np.isfinite(self._base).all() and np.isfinite(self._wheels).all()):
+            raise PlantError(f"the plant's state is not finite at {self._steps * self.dt:.3f} s")
 
     def state(self) -> PlantState:
         """Return the truth now; the pose is that of base_link's origin, seen from above."""
