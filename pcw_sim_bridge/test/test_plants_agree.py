@@ -99,8 +99,30 @@ def test_closed_loop_runs_agree(engine: str, path: Callable[[float], np.ndarray]
 
 @pytest.mark.parametrize(("path", "rate"), PATHS)
 def test_results_do_not_hang_on_the_engine(path: Callable[[float], np.ndarray], rate: float) -> None:
-    """On the same springs and tyres two engines are within 0.05 mm: what they do in their own ways is bodies and rotors."""
+    """On the same springs and tyres two engines are within 5 micrometres: only bodies and rotors are each one's own work."""
     pytest.importorskip("mujoco", reason="MuJoCo, which is optional, is not installed")
     apart = furthest_apart(drive("mujoco", path, rate)[0], drive("pybullet", path, rate)[0])
-    print(f"\n{path.__name__}: engines within {1e3 * apart:.4f} mm")
-    assert apart < 5e-5
+    print(f"\n{path.__name__}: engines within {1e6 * apart:.2f} micrometres")
+    assert apart < 5e-6
+
+
+@pytest.mark.parametrize("name", ["thesis", "tidybot2", "xr4000"])
+def test_engines_agree_under_changing_torques(name: str) -> None:
+    """Torques that jump and wheels turned anyhow, in open loop: joint rates within 1 % of the fastest.
+
+    In PyBullet rotors are part of fork and wheel. That they push against the base when they spin up, and turn with it when it
+    pitches, was not taken back: 3.4 % on the thesis robot, at any step. What is left now goes with the step, as PyBullet's
+    correction comes a step late: 0.5 % at 1 ms on the thesis robot, 2.7 % on one whose gears couple strongly.
+    """
+    pytest.importorskip("mujoco", reason="MuJoCo, which is optional, is not installed")
+    robot = load_robot(name)
+    rates = []
+    for plant_name in ("pybullet", "mujoco"):
+        rng = np.random.default_rng(1)
+        plant = make_plant(plant_name, robot, 2.5e-4)
+        plant.reset(steer_angle=rng.normal(size=robot.n))
+        for _ in range(10):
+            plant.step(0.1 * robot.torque_limit * rng.normal(size=(robot.n, 2)), 120)
+        rates.append(plant.state().joint_velocity)
+        plant.close()
+    np.testing.assert_allclose(rates[0], rates[1], atol=0.01 * np.abs(rates[1]).max())

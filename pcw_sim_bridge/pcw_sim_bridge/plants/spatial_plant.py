@@ -21,7 +21,6 @@ from .caster_arrays import (
     MOTOR_PHI,
     MOTOR_RHO,
     PHI,
-    PHI_DDOT,
     PHI_DOT,
     RHO,
     RHO_DDOT,
@@ -131,6 +130,12 @@ class SpatialPlant:
         self._wheels = np.zeros((robot.n, WHEEL_STATE))
         self._base = np.zeros(BASE_STATE)
         self._engine = make_engine(bodies, self._effects.gravity, dt, gui, lifted)
+        # Rotors in the bodies are set right with the accelerations of the last step. Were those taken as they are, the
+        # correction would swing up as soon as the rotors have more than half the inertia J of the chassis I; taken by less
+        # than 2 / (2 + J / I) it settles for any.
+        # (Eigenvalues 1 - q of the correction's loop: q + 1 / q = 2 + J / I at the most.)
+        rotors = float(np.trace(self._engine.body_rotors.sum(axis=0)))
+        self._trust = 1.0 / (1.0 + rotors / min(bodies.chassis.principal_inertias()))
         self.reset()
 
     def reset(self, pose: FloatArray | None = None, steer_angle: FloatArray | None = None) -> None:
@@ -140,7 +145,7 @@ class SpatialPlant:
         if steer_angle is not None:
             joints[:, PHI - RHO] = steer_angle
         self._wheels[:] = 0.0
-        self._acceleration = np.zeros(3)
+        self._acceleration, self._angular_acceleration = np.zeros(6), np.zeros(3)
         self._yaw = float(start[2])
         self._steps = 0
         self._effects.reset()
@@ -161,8 +166,8 @@ class SpatialPlant:
         self._wheels[:, FZ] = normal_force
         self._effects.reset()
         self._place(start, height, turned(attitude, start[2] - heading_of(rotation)), joints)
-        self._wheels[:, RHO_DDOT : PHI_DDOT + 1] = 0.0
         self._acceleration[:] = 0.0
+        self._angular_acceleration[:] = 0.0
         self._yaw = float(start[2])
         self._steps = 0
 
@@ -214,14 +219,15 @@ class SpatialPlant:
             before[LINEAR],
             before[ANGULAR],
             self._com_in_base,
-            self._acceleration[2],
+            self._angular_acceleration,
             self._wheels,
         )
         self._engine.advance(wrench, joint_torque)
         self._read()
-        self._wheels[:, RHO_DDOT : PHI_DDOT + 1] = (self._wheels[:, RHO_DOT : PHI_DOT + 1] - rates_before) / self.dt
-        change = (self._base - before) / self.dt
-        self._acceleration[:] = change[7], change[8], change[12]
+        joint_acceleration = (self._wheels[:, RHO_DOT : PHI_DOT + 1] - rates_before) / self.dt
+        self._wheels[:, RHO_DDOT:] += self._trust * (joint_acceleration - self._wheels[:, RHO_DDOT:])
+        self._acceleration[:] = (self._base[7:] - before[7:]) / self.dt
+        self._angular_acceleration += self._trust * (self._acceleration[3:] - self._angular_acceleration)
         self._yaw += self.dt * self._base[12]
         self._steps += 1
 
@@ -255,7 +261,7 @@ class SpatialPlant:
         self._yaw = yaw
         c, s = math.cos(yaw), math.sin(yaw)
         to_base = np.array([[c, s], [-s, c]])
-        yaw_acceleration, yaw_rate = self._acceleration[2], angular[2]
+        yaw_acceleration, yaw_rate = self._acceleration[5], angular[2]
         spin = np.array(
             [
                 -yaw_acceleration * arm[1] - yaw_rate**2 * arm[0],
