@@ -130,10 +130,9 @@ class SpatialPlant:
         self._wheels = np.zeros((robot.n, WHEEL_STATE))
         self._base = np.zeros(BASE_STATE)
         self._engine = make_engine(bodies, self._effects.gravity, dt, gui, lifted)
-        # Rotors in the bodies are set right with the accelerations of the last step. Were those taken as they are, the
-        # correction would swing up as soon as the rotors have more than half the inertia J of the chassis I; taken by less
-        # than 2 / (2 + J / I) it settles for any.
-        # (Eigenvalues 1 - q of the correction's loop: q + 1 / q = 2 + J / I at the most.)
+        # Rotors in the bodies are set right with accelerations that are a step old. From step to step that is a loop with
+        # eigenvalues 1 - q, where q + 1 / q = 2 + J / I for rotors J in a chassis I: beyond J = I / 2 it swings up. Taking
+        # over only a part below 2 / (2 + J / I) of each new acceleration, it settles.
         rotors = float(np.trace(self._engine.body_rotors.sum(axis=0)))
         self._trust = 1.0 / (1.0 + rotors / min(bodies.chassis.principal_inertias()))
         self.reset()
