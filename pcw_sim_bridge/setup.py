@@ -30,7 +30,10 @@ setup(
     ],
     python_requires=">=3.11",
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    extras_require={
+        "test": ["pytest"],
+        "mujoco": ["mujoco>=3.3.1"],  # the first with armature on tendons, which the rotors are
+    },
     zip_safe=False,
     maintainer="PCW maintainers",
     maintainer_email="pcw-maintainers@example.org",

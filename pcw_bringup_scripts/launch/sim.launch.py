@@ -20,10 +20,10 @@ from launch_ros.substitutions import FindPackageShare
 # name, default, meaning
 ARGUMENTS = (
     ("robot", "thesis", "a .yaml file or a shipped robot"),
-    ("plant", "reduced", "reduced or pybullet"),
+    ("plant", "reduced", "reduced, pybullet or mujoco"),
     ("real_time_factor", "1.0", "simulated per real time; 0 is as fast as possible"),
     ("seed", "0", "seed of the sensor noise"),
-    ("gui", "false", "show the window of PyBullet"),
+    ("gui", "false", "show the window of PyBullet or MuJoCo"),
     ("lockstep", "false", "the simulation waits for the controller"),
     ("rviz", "false", "show the robot, its contact forces, slip and ground patches in RViz"),
     ("record", "", "folder to make for a recording; empty: none"),

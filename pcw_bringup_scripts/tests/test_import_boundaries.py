@@ -63,7 +63,8 @@ names = [package]
 module = importlib.import_module(package)
 for found in pkgutil.walk_packages(module.__path__, package + ".", onerror=lambda name: None):
     parts = found.name.split(".")
-    backend = "plants" in parts and parts[-1].startswith("pybullet") or parts[-1].split("_")[-1] == "can"
+    engine = "plants" in parts and parts[-1].startswith(("pybullet", "mujoco"))
+    backend = engine or parts[-1].split("_")[-1] == "can"
     if "nodes" not in parts and not backend:
         importlib.import_module(found.name)
         names.append(found.name)
@@ -98,7 +99,7 @@ def violations(package: str, path: str, source: str) -> list[str]:
     """What a file at `path` inside the Python package `package` imports and must not."""
     place = PurePosixPath(path)
     in_nodes = "nodes" in place.parts[:-1]
-    in_pybullet_backend = "plants" in place.parts[:-1] and place.name.startswith("pybullet")
+    backend = place.name if "plants" in place.parts[:-1] else ""
     in_can_module = "can" in place.stem.split("_") or "can" in place.parts[:-1]
     found = []
     for name in sorted(imported_modules(ast.parse(source), package, place)):
@@ -109,8 +110,10 @@ def violations(package: str, path: str, source: str) -> list[str]:
             found.append(f"{name}: ROS lives only under nodes/")
         if top in MAY_IMPORT and ".nodes" in name and not in_nodes and package != "pcw_bringup_scripts":
             found.append(f"{name}: a core does not import nodes")
-        if top in ("pybullet", "pybullet_data", "pybullet_utils") and not in_pybullet_backend:
+        if top in ("pybullet", "pybullet_data", "pybullet_utils") and not backend.startswith("pybullet"):
             found.append(f"{name}: PyBullet lives only in plants/pybullet*.py")
+        if top == "mujoco" and not backend.startswith("mujoco"):
+            found.append(f"{name}: MuJoCo lives only in plants/mujoco*.py")
         if top == "can" and not in_can_module:
             found.append(f"{name}: python-can lives only in the CAN modules")
     return found
@@ -165,6 +168,9 @@ def test_no_modules_import_each_other_in_a_circle():
         ("pcw_estimation", "sub/encoder_slip.py", "from ..nodes.odometry import main"),
         ("pcw_sim_bridge", "plants/reduced.py", "import pybullet as p"),
         ("pcw_sim_bridge", "pybullet.py", "import pybullet"),
+        ("pcw_sim_bridge", "plants/factory.py", "def f():\n    import mujoco.viewer"),
+        ("pcw_sim_bridge", "plants/pybullet_plant.py", "from mujoco import MjModel"),
+        ("pcw_sim_bridge", "plants/mujoco_plant.py", "import pybullet"),
         ("pcw_control", "scanner.py", "import can"),
     ],
 )
@@ -177,6 +183,7 @@ def test_what_must_not_be_imported_is_found(package, path, source):
     [
         ("pcw_control", "nodes/computed_torque.py", "import rclpy\nfrom pcw_control import computed_torque"),
         ("pcw_sim_bridge", "plants/pybullet.py", "import pybullet"),
+        ("pcw_sim_bridge", "plants/mujoco_plant.py", "def f():\n    import mujoco.viewer"),
         ("pcw_sim_bridge", "plants/reduced.py", "from pcw_description.contact import kiencke"),
         ("pcw_bringup_scripts", "compose.py", "import rclpy\nfrom pcw_control.nodes import computed_torque"),
         ("pcw_control", "motor_can.py", "import can"),
@@ -188,8 +195,8 @@ def test_what_may_be_imported_is_left_alone(package, path, source):
 
 @pytest.mark.parametrize("package", [name for name in MAY_IMPORT if name != "pcw_bringup_scripts"])
 def test_cores_import_where_ros_is_blocked(package):
-    """In the installation: every module outside nodes/ and the backends, with ROS, PyBullet and python-can blocked."""
-    blocked = sorted(ROS_MODULES | {"pybullet", "can"} | (set(MAY_IMPORT) - MAY_IMPORT[package] - {package}))
+    """In the installation: every module outside nodes/ and the backends, with ROS, both engines and python-can blocked."""
+    blocked = sorted(ROS_MODULES | {"pybullet", "mujoco", "can"} | (set(MAY_IMPORT) - MAY_IMPORT[package] - {package}))
     done = subprocess.run(
         [sys.executable, "-c", IMPORT_CORES, package, *blocked],
         capture_output=True,

@@ -12,10 +12,10 @@ from launch_ros.parameter_descriptions import ParameterValue
 # name, default, meaning, type
 ARGUMENTS = (
     ("robot", "thesis", "a .yaml file or a shipped robot", str),
-    ("plant", "reduced", "reduced or pybullet", str),
+    ("plant", "reduced", "reduced, pybullet or mujoco", str),
     ("real_time_factor", "1.0", "simulated per real time; 0 is as fast as possible", float),
     ("seed", "0", "seed of the sensor noise", int),
-    ("gui", "false", "show the window of PyBullet", bool),
+    ("gui", "false", "show the window of PyBullet or MuJoCo", bool),
     ("lockstep", "false", "wait for a command after each joint_states", bool),
 )
 

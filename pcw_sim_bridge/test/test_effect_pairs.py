@@ -71,7 +71,6 @@ def test_every_pair_of_effects_runs(names: tuple[str, str]) -> None:
     drive_about("reduced", names, seed=2)
 
 
-@pytest.mark.parametrize("plant_name", ["reduced", "pybullet"])
 def test_all_effects_run_together(plant_name: str) -> None:
     """Five seconds of everything, in three sizes."""
     for seed in range(3):

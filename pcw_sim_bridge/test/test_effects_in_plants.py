@@ -28,14 +28,8 @@ WEIGHT = THESIS.total_mass * GRAVITY
 DRIVE_INERTIA = THESIS.casters[0].wheel.inertia_axle + float(THESIS.armature[0, DRIVE, DRIVE])
 ROLLING_MASS = THESIS.total_mass + 4.0 * DRIVE_INERTIA / RADIUS**2
 ZERO = np.zeros((4, 2))
-PLANTS = ("reduced", "pybullet")
 # Where waves of 1 m lift one diagonal of the wheels and lower the other.
 UNEVEN_PLACE = np.array([0.0, 0.25, 0.0])
-
-
-@pytest.fixture(params=PLANTS)
-def plant_name(request):
-    return request.param
 
 
 def steer_inertia(robot=THESIS) -> float:

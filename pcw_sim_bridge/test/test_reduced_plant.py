@@ -310,7 +310,7 @@ def test_bad_input_is_refused_and_changes_nothing() -> None:
     with pytest.raises(PlantError, match="NaN"):
         plant.step(torque)
     assert plant.state().time == 0.0
-    with pytest.raises(PlantError, match="'gazebo' is not allowed; allowed: reduced, pybullet"):
+    with pytest.raises(PlantError, match="'gazebo' is not allowed; allowed: reduced, pybullet, mujoco"):
         make_plant("gazebo", robot)
     with pytest.raises(PlantError, match="dt = 0.1 s is not allowed"):
         make_plant("reduced", robot, dt=0.1)

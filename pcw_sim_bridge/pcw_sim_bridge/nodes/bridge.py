@@ -44,7 +44,7 @@ class BridgeNode(Node):
         dt = declare(self, "dt", 0.001, "step of the plant", "s", (1e-4, 5e-3), read_only=True)
         seed = declare(self, "seed", 0, "seed of the sensor noise", range=(0, 2**31 - 1), read_only=True)
         lifted = declare(self, "lifted", False, "the robot is on a jack, its wheels off the ground", read_only=True)
-        gui = declare(self, "gui", False, "show the plant's window (pybullet)", read_only=True)
+        gui = declare(self, "gui", False, "show the plant's window (pybullet, mujoco)", read_only=True)
         source = declare(
             self, "velocity_source", "drive", "where measured joint speeds come from", read_only=True, choices=VELOCITY_SOURCES
         )

@@ -12,14 +12,14 @@ def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool =
     """Make a plant of the robot.
 
     Args:
-        name: "reduced" (planar, compiled) or "pybullet" (three-dimensional).
+        name: "reduced" (planar, compiled), "pybullet" or "mujoco" (three-dimensional).
         robot: the robot, with the effects of its `physics` at work.
         dt: step [s].
-        gui: show a window (PyBullet only).
+        gui: show a window (not of the reduced plant).
         lifted: on a jack, the wheels off the ground.
 
     Raises:
-        PlantError: unknown name or a step that is not in 0.0001 to 0.005 s.
+        PlantError: unknown name, an engine that is not installed, or a step that is not in 0.0001 to 0.005 s.
         KinematicsError: the robot cannot be torque controlled.
     """
     if name not in PLANT_NAMES:
@@ -29,6 +29,13 @@ def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool =
     robot.require_torque_control()
     if name == "reduced":
         return ReducedPlant(robot, dt, lifted)
-    from .pybullet_plant import PybulletPlant  # the engine takes a while to load, and prints a line
+    # An engine takes a while to load, and not every machine has both.
+    if name == "pybullet":
+        from .pybullet_plant import PybulletPlant
 
-    return PybulletPlant(robot, dt, gui, lifted)
+        return PybulletPlant(robot, dt, gui, lifted)
+    try:
+        from .mujoco_plant import MujocoPlant
+    except ImportError as error:
+        raise PlantError(f"the plant 'mujoco' needs MuJoCo, which cannot be loaded ({error}): pip install mujoco") from error
+    return MujocoPlant(robot, dt, gui, lifted)

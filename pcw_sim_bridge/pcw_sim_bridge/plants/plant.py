@@ -11,7 +11,7 @@ import numpy as np
 from pcw_description.errors import PcwError
 from pcw_description.robot_description import FloatArray, RobotDescription
 
-PLANT_NAMES = ("reduced", "pybullet")
+PLANT_NAMES = ("reduced", "pybullet", "mujoco")
 
 
 class PlantError(PcwError):

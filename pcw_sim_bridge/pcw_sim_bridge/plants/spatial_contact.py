@@ -4,10 +4,10 @@ A three-dimensional engine carries the rigid bodies; this gives it everything th
 are handed over as their exact equivalent in generalised forces: engines that apply a force at a moving link do so at a
 link pose one step old, which falsifies the axle torque (EQUATIONS section 4).
 
-Reflected rotors are defined by N^T J N on the joint rates. The engine carries the drive's share as inertia of the wheel
-and the steering's as inertia of the fork; what that adds beyond the definition is taken back here, with the
-accelerations of the last step: the fork's coupling to the yaw rate, the gyroscopic torque of the wheel's share, and the
-drive/steer coupling of the gears is added.
+Reflected rotors are defined by N^T J N on the joint rates. An engine that cannot do that carries the drive's share as
+inertia of the wheel and the steering's as inertia of the fork; what that adds beyond the definition is taken back here,
+with the accelerations of the last step: that the body's own turning turns the rotor too, that the rotor's spinning up and
+gyroscopic torque push against the base, and the drive/steer coupling of the gears is added.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ from .caster_arrays import (
     I_ROLL,
     IZZ,
     J_PP,
-    J_RP,
     MASS,
     PHI,
     PHI_DDOT,
@@ -107,7 +106,7 @@ def contact_wrench(  # type: ignore[no-untyped-def]
     chassis_mass,
     casters,
     suspension,
-    drive_armature,
+    body_rotors,
     effects,
     command,
     position,
@@ -115,7 +114,7 @@ def contact_wrench(  # type: ignore[no-untyped-def]
     linear_velocity,
     angular_velocity,
     com_in_base,
-    yaw_acceleration,
+    angular_acceleration,
     wheels,
 ):
     """Advance the tyres by dt and return the wrench on the base (6,) about its centre of mass and joint torques (n, 2).
@@ -126,13 +125,14 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         chassis_mass: of the base link [kg].
         casters: constant numbers (n, TYRE + TYRE_SIZE).
         suspension: vertical stiffness [N/m] and damping [N s/m] of one wheel.
-        drive_armature: rotor inertia carried by each wheel body (n,) [kg m^2].
+        body_rotors: reflected rotors that the engine carries in fork and wheel, not on the joints (n, 2, 2) [kg m^2].
         effects: see `EffectTables`.
         command: motor torques (n, 2) [N m], limited here.
         position, quaternion, linear_velocity, angular_velocity: motion of the base link's centre of mass, world axes.
         com_in_base: centre of mass of the base link in base_link (3,) [m].
-        yaw_acceleration: of the last step [rad/s^2].
-        wheels: state (n, WHEEL_STATE); positions, velocities and the accelerations of the last step as the engine has
+        angular_acceleration: of the base link (3,) in world axes, of the last step or smoothed over the last steps
+            [rad/s^2]; so those of the joints in `wheels`.
+        wheels: state (n, WHEEL_STATE); positions, velocities and the last accelerations as the engine has
             them, the rest is filled here.
     """
     n = len(casters)
@@ -207,7 +207,7 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         # On a gradient the normal force leans, and goes through the wheel centre.
         lean = np.zeros(3)
         lean[0], lean[1] = -normal * gradient_x, -normal * gradient_y
-        moment = spin * up + _cross(turning, drive_armature[i] * row[RHO_DOT] * axle)
+        moment = spin * up + _cross(turning, body_rotors[i, 0, 0] * row[RHO_DOT] * axle)
         wrench[:3] += force + lean
         wrench[3:] += _cross(contact, force) + _cross(arm, lean) + moment
         motor_torques(i, dt, casters[i], command[i], row, effects, at)
@@ -215,10 +215,11 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         tau_rho += axle @ _cross(contact - arm, force)
         tau_phi += axis @ (_cross(contact - arm + from_axis, force) + _cross(from_axis, lean) + moment)
         # Rotors: back to the definition N^T J N on the joint rates.
-        armature = casters[i, J_PP]
-        tau_rho -= casters[i, J_RP] * row[PHI_DDOT]
-        tau_phi += armature * yaw_acceleration - casters[i, J_RP] * row[RHO_DDOT]
-        wrench[3:] += armature * (yaw_acceleration + row[PHI_DDOT]) * axis
+        drive_rotor, steer_rotor, gear_coupling = body_rotors[i, 0, 0], body_rotors[i, 1, 1], body_rotors[i, 0, 1]
+        about_axle, about_axis = axle @ angular_acceleration, axis @ angular_acceleration
+        tau_rho += drive_rotor * about_axle - gear_coupling * row[PHI_DDOT]
+        tau_phi += steer_rotor * about_axis - gear_coupling * row[RHO_DDOT]
+        wrench[3:] += drive_rotor * (row[RHO_DDOT] + about_axle) * axle + steer_rotor * (row[PHI_DDOT] + about_axis) * axis
         # The engine steps explicitly: it gets the torque that an implicit step would end with, at rest the very same.
         tau_rho /= 1.0 + dt * s_rr / _joint_inertia(casters[i], 0)
         tau_phi /= 1.0 + dt * s_pp / _joint_inertia(casters[i], 1)
