@@ -46,7 +46,7 @@ from pcw_sim_bridge.simulated_robot import JointCommand, SimulatedRobot
 FORMAT = "pcw_benchmark/1"
 STEP = 1e-3  # of the plants [s]
 MICROSECONDS, REAL_TIME = "us", "x real time"
-LIBRARIES = ("numpy", "scipy", "numba", "pybullet")
+LIBRARIES = ("numpy", "scipy", "numba", "pybullet", "mujoco")
 Prepare = Callable[[RobotDescription], Callable[[], float]]
 
 
@@ -252,10 +252,11 @@ TASKS = (
     Task("reduced plant at 1 ms, in batch", REAL_TIME, 800.0, reduced_in_batch),
     Task("reduced plant at 1 ms, stepped from Python", REAL_TIME, 200.0, reduced_stepped(read=False)),
     Task("the same, its state read after each step", REAL_TIME, None, reduced_stepped(read=True)),
-    Task("the same in batch, all effects at work", REAL_TIME, 300.0, with_all_effects(reduced_in_batch)),
+    Task("reduced plant in batch, all effects at work", REAL_TIME, 300.0, with_all_effects(reduced_in_batch)),
     Task("reduced plant with sensors and controller", REAL_TIME, None, with_controller("reduced", 1.0)),
     Task("PyBullet plant with sensors and controller", REAL_TIME, 8.0, with_controller("pybullet", 1.0)),
-    Task("the same, all effects at work", REAL_TIME, 6.0, with_all_effects(with_controller("pybullet", 1.0))),
+    Task("MuJoCo plant with sensors and controller", REAL_TIME, None, with_controller("mujoco", 1.0)),
+    Task("PyBullet plant, all effects, with the same", REAL_TIME, 6.0, with_all_effects(with_controller("pybullet", 1.0))),
 )
 
 
