@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from pcw_description.compiled import compiled
 from pcw_description.robot_description import STATIC_DEFLECTION, FloatArray, RobotDescription
 
 from .caster_arrays import (
@@ -33,7 +34,7 @@ from .caster_arrays import (
     caster_numbers,
 )
 from .effect_tables import EffectTables
-from .plant import PlantError, PlantState, gravity_in_base
+from .plant import PlantError, PlantState
 from .spatial_contact import contact_wrench, rotation_matrix
 from .true_robot import as_it_really_is, without_geared_rotors
 
@@ -91,6 +92,47 @@ def turned(quaternion: FloatArray, angle: float) -> FloatArray:
 def heading_of(rotation: FloatArray) -> float:
     """Return the yaw [rad] of a rotation matrix (3, 3), between -pi and pi."""
     return math.atan2(rotation[1, 0], rotation[0, 0])
+
+
+@compiled
+def _take_accelerations(  # type: ignore[no-untyped-def]
+    dt, trust, before, base, rates_before, wheels, acceleration, angular_acceleration
+):
+    """Fill the accelerations of a step from the velocities around it; those that go on to the next one are smoothed."""
+    for k in range(6):
+        acceleration[k] = (base[7 + k] - before[7 + k]) / dt
+    for k in range(3):
+        angular_acceleration[k] += trust * (acceleration[3 + k] - angular_acceleration[k])
+    for i in range(len(wheels)):
+        for k in range(2):
+            found = (wheels[i, RHO_DOT + k] - rates_before[i, k]) / dt
+            wheels[i, RHO_DDOT + k] += trust * (found - wheels[i, RHO_DDOT + k])
+
+
+@compiled
+def _seen_from_above(base, acceleration, com_in_base, gravity, turned_yaw):  # type: ignore[no-untyped-def]
+    """Return the yaw [rad], continuous, and in the rows of (4, 3) pose, twist, acceleration and gravity; see `PlantState`."""
+    rotation = rotation_matrix(base[3:7])
+    arm = np.empty(3)
+    for k in range(3):
+        arm[k] = -(rotation[k, 0] * com_in_base[0] + rotation[k, 1] * com_in_base[1] + rotation[k, 2] * com_in_base[2])
+    roll_rate, pitch_rate, yaw_rate = base[10], base[11], base[12]
+    velocity_x = base[7] + pitch_rate * arm[2] - yaw_rate * arm[1]
+    velocity_y = base[8] + yaw_rate * arm[0] - roll_rate * arm[2]
+    heading = math.atan2(rotation[1, 0], rotation[0, 0])
+    # The engine's yaw is wrapped; the integrated rate says which turn it is.
+    yaw = heading + 2.0 * math.pi * round((turned_yaw - heading) / (2.0 * math.pi))
+    c, s = math.cos(yaw), math.sin(yaw)
+    acceleration_x = acceleration[0] - acceleration[5] * arm[1] - yaw_rate * yaw_rate * arm[0]
+    acceleration_y = acceleration[1] + acceleration[5] * arm[0] - yaw_rate * yaw_rate * arm[1]
+    truth = np.empty((4, 3))
+    truth[0, 0], truth[0, 1], truth[0, 2] = base[0] + arm[0], base[1] + arm[1], yaw
+    truth[1, 0], truth[1, 1], truth[1, 2] = c * velocity_x + s * velocity_y, c * velocity_y - s * velocity_x, yaw_rate
+    truth[2, 0], truth[2, 1] = c * acceleration_x + s * acceleration_y, c * acceleration_y - s * acceleration_x
+    truth[2, 2] = acceleration[5]
+    truth[3, 0], truth[3, 1] = c * gravity[0] + s * gravity[1], c * gravity[1] - s * gravity[0]
+    truth[3, 2] = gravity[2]
+    return yaw, truth
 
 
 class SpatialPlant:
@@ -223,10 +265,16 @@ class SpatialPlant:
         )
         self._engine.advance(wrench, joint_torque)
         self._read()
-        joint_acceleration = (self._wheels[:, RHO_DOT : PHI_DOT + 1] - rates_before) / self.dt
-        self._wheels[:, RHO_DDOT:] += self._trust * (joint_acceleration - self._wheels[:, RHO_DDOT:])
-        self._acceleration[:] = (self._base[7:] - before[7:]) / self.dt
-        self._angular_acceleration += self._trust * (self._acceleration[3:] - self._angular_acceleration)
+        _take_accelerations(
+            self.dt,
+            self._trust,
+            before,
+            self._base,
+            rates_before,
+            self._wheels,
+            self._acceleration,
+            self._angular_acceleration,
+        )
         self._yaw += self.dt * self._base[12]
         self._steps += 1
 
@@ -246,36 +294,18 @@ class SpatialPlant:
 
     def state(self) -> PlantState:
         """Return the truth now; the pose is that of base_link's origin, seen from above."""
-        linear, angular = self._base[LINEAR], self._base[ANGULAR]
-        rotation = rotation_matrix(self._base[QUATERNION])
-        arm = -rotation @ self._com_in_base
-        origin = self._base[POSITION] + arm
-        # Of linear + angular x arm the horizontal part; np.cross is slow on single vectors.
-        velocity = np.array(
-            [linear[0] + angular[1] * arm[2] - angular[2] * arm[1], linear[1] + angular[2] * arm[0] - angular[0] * arm[2]]
-        )
-        heading = heading_of(rotation)
-        # The engine's yaw is wrapped; the integrated rate says which turn it is.
-        yaw = heading + 2.0 * math.pi * round((self._yaw - heading) / (2.0 * math.pi))
-        self._yaw = yaw
-        c, s = math.cos(yaw), math.sin(yaw)
-        to_base = np.array([[c, s], [-s, c]])
-        yaw_acceleration, yaw_rate = self._acceleration[5], angular[2]
-        spin = np.array(
-            [
-                -yaw_acceleration * arm[1] - yaw_rate**2 * arm[0],
-                yaw_acceleration * arm[0] - yaw_rate**2 * arm[1],
-            ]
+        self._yaw, truth = _seen_from_above(
+            self._base, self._acceleration, self._com_in_base, self._effects.gravity, self._yaw
         )
         wheels = self._wheels
         joint_position, joint_velocity = wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
         motor_position, motor_velocity = self._effects.motor_motion(joint_position, joint_velocity)
         return PlantState(
             time=self._steps * self.dt,
-            pose=np.array([origin[0], origin[1], yaw]),
-            twist=np.array([*(to_base @ velocity), yaw_rate]),
-            acceleration=np.array([*(to_base @ (self._acceleration[:2] + spin)), yaw_acceleration]),
-            gravity=gravity_in_base(self._effects.gravity, yaw),
+            pose=truth[0],
+            twist=truth[1],
+            acceleration=truth[2],
+            gravity=truth[3],
             joint_position=joint_position,
             joint_velocity=joint_velocity,
             motor_position=motor_position,
