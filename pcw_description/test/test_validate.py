@@ -76,7 +76,7 @@ def test_readme_holds_what_the_command_prints(capsys: pytest.CaptureFixture[str]
 
 
 def test_example_of_the_readme_runs() -> None:
-    [example] = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    example, *_ = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, object] = {}
     exec(example, names)  # noqa: S102 - our own text
     assert names["inertia"].shape == (3, 3) and names["joint_velocity"].shape == (4, 2)  # type: ignore[attr-defined]

@@ -69,9 +69,10 @@ def _simulate(  # type: ignore[no-untyped-def]
             total = force + disturbance[k]
             start = 0
             for index in range(len(kernels)):
-                total += kernels[index](
+                added, _ = kernels[index](
                     position, velocity, force, 0.0, parameters[start : start + counts[index]]
                 )
+                total += added
                 start += counts[index]
             velocity += step / substeps * total / inertia
             position += step / substeps * velocity
