@@ -254,6 +254,8 @@ DEFAULT_TOLERANCES: Mapping[str, Tolerance] = {
     "contact.mu_p": Tolerance(0.1, "1", True),
     # Tyre and whatever suspends the wheel act as one spring, and hardly anybody has measured it.
     "contact.stiffness": Tolerance(0.5, "1", True),
+    # What passes for a level floor: 2 mm in a metre.
+    "ground.slope": Tolerance(0.002, "rad", False),
     "imu.position": Tolerance(0.005, "m", False),
     "imu.gyro_bias": Tolerance(0.002, "rad/s", False),
     "imu.accelerometer_bias": Tolerance(0.05, "m/s^2", False),

@@ -8,6 +8,7 @@ import pytest
 
 from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -118,6 +119,29 @@ def test_an_effect_that_the_description_holds_is_not_left_over(tmp_path: Path) -
     after = RobotProblemBuilder(patched, [recording]).build()
     rms = [np.sqrt(np.mean(np.where(p.valid, p.residual, 0.0)[:, :3] ** 2, axis=0)) for p in (before, after)]
     assert np.all(rms[1][:2] < 0.3 * rms[0][:2])
+
+
+def test_effects_of_every_kind_that_the_description_holds_are_not_left_over(tmp_path: Path) -> None:
+    """Slope, drag, a wrong zero, and an IMU that is wrong in every way, all in the file: what is left is a healthy robot's."""
+    nominal = load_robot("thesis")
+    entries = [
+        {"name": "ground_slope", "angle": 0.03, "direction": 1.0},
+        {"name": "aerodynamic_drag", "coefficient": 10.0},
+        {"name": "steer_zero_offset", "target": ["front_left"], "offset": 0.04},
+        {"name": "wheel_radius_error", "target": ["rear_left"], "error": 1e-3},
+        {"name": "imu_bias", "gyro": 0.05, "accelerometer_y": 0.3},
+        {"name": "imu_scale", "gyro": 0.1},
+        {"name": "imu_lever_arm", "x": 0.1},
+        {"name": "clock_offset", "offset": 0.02},
+    ]
+    robot = dataclasses.replace(nominal, physics=read_physics(entries, nominal.caster_names))
+    wrong, healthy = record(tmp_path / "wrong", robot, 6), record(tmp_path / "healthy", nominal, 6)
+    left = []
+    for described, recording in ((nominal, wrong), (robot, wrong), (nominal, healthy)):
+        problem = RobotProblemBuilder(described, [recording]).build()
+        left.append(np.sqrt(np.mean(np.where(problem.valid, problem.residual, 0.0) ** 2, axis=0)))
+    assert np.all(left[0] > 1.5 * left[2]), "every channel shows something"
+    assert np.all(left[1] < 1.5 * left[2])
 
 
 def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ EFFECT = DescriptionEffect(
     summary="The wheel centre is not where the description has it, seen from the steering axis.",
     sentence="The wheel of {target} is {x:+.3g} m ahead and {y:+.3g} m to the left of its described place.",
     parameters=(
-        EffectParameter("x", "m", "along the rolling direction", -0.5, 0.5, 1e-3),
-        EffectParameter("y", "m", "across it, to the left", -0.5, 0.5, 1e-3, default=0.0),
+        EffectParameter("x", "m", "along the rolling direction", -0.5, 0.5, 1e-3, near_linear=True),
+        EffectParameter("y", "m", "across it, to the left", -0.5, 0.5, 1e-3, default=0.0, near_linear=True),
     ),
     sensors=("joint_states", "imu/data", "ground_truth/odom"),
     look_alikes=("wheel_radius_error", "steer_zero_offset", "tyre_lateral_stiffness"),

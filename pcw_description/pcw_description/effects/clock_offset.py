@@ -18,7 +18,7 @@ EFFECT = ClockEffect(
     summary="The stamps of a sensor come from a clock ahead of, or behind, that of the joints.",
     sentence="The IMU's stamps are {offset:+.3g} s ahead of the joints' clock, the tracker's {tracker_offset:+.3g} s.",
     parameters=(
-        EffectParameter("offset", "s", "stamp of the IMU minus true time", -1.0, 1.0, 0.005),
+        EffectParameter("offset", "s", "stamp of the IMU minus true time", -1.0, 1.0, 0.005, near_linear=True),
         EffectParameter("tracker_offset", "s", "stamp of the tracker minus true time", -1.0, 1.0, 0.02, default=0.0),
     ),
     sensors=("imu/data", "ground_truth/odom"),

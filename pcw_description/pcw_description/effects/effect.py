@@ -27,6 +27,7 @@ class EffectParameter:
         typical: a size at which the effect matters on a robot of 50 to 100 kg; the analyser's prior scale.
         default: used when the description leaves the parameter out; None if it must be given.
         linear: the contribution is proportional to this parameter (all linear parameters together are additive).
+        near_linear: it is so near zero, where the effect vanishes with it; its derivative there tells how the effect shows.
     """
 
     name: str
@@ -37,6 +38,7 @@ class EffectParameter:
     typical: float
     default: float | None = None
     linear: bool = False
+    near_linear: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +83,11 @@ class Effect:
     def linear_parameters(self) -> tuple[EffectParameter, ...]:
         """The parameters that the contribution is proportional to."""
         return tuple(parameter for parameter in self.parameters if parameter.linear)
+
+    @property
+    def searched_parameters(self) -> tuple[EffectParameter, ...]:
+        """The parameters whose size, beginning at none, a derivative can find."""
+        return tuple(parameter for parameter in self.parameters if parameter.linear or parameter.near_linear)
 
     @property
     def nonlinear_parameters(self) -> tuple[EffectParameter, ...]:

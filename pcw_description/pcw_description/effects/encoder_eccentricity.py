@@ -24,7 +24,7 @@ EFFECT = EncoderEffect(
     summary="The encoder's disc is mounted off its axis, so that the reading swings around the angle once per turn.",
     sentence="The encoder of the {joint} of {target} swings by {amplitude:.3g} rad once per turn, phase {phase:.3g} rad.",
     parameters=(
-        EffectParameter("amplitude", "rad", "largest error of the angle", 0.0, 0.5, 5e-3),
+        EffectParameter("amplitude", "rad", "largest error of the angle", 0.0, 0.5, 5e-3, near_linear=True),
         EffectParameter("phase", "rad", "the error is the sine of the angle plus this", -6.3, 6.3, 1.0, default=0.0),
     ),
     sensors=("joint_states",),

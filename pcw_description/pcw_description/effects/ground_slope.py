@@ -24,7 +24,7 @@ EFFECT = GravityEffect(
     summary="The floor is an inclined plane: gravity pulls the robot downhill and loads the lower wheels.",
     sentence="The floor falls by {angle:.3g} rad towards {direction:.3g} rad in the world.",
     parameters=(
-        EffectParameter("angle", "rad", "inclination", 0.0, 0.7, 0.01),
+        EffectParameter("angle", "rad", "inclination", 0.0, 0.7, 0.01, near_linear=True),
         EffectParameter("direction", "rad", "where downhill is, from x of the world", -6.3, 6.3, 0.0, default=0.0),
     ),
     sensors=("joint_states", "imu/data"),

@@ -25,8 +25,8 @@ EFFECT = DescriptionEffect(
     summary="The IMU is mounted elsewhere than described, so that turning adds to what it accelerates.",
     sentence="The IMU sits {x:+.3g} m ahead and {y:+.3g} m to the left of its described place.",
     parameters=(
-        EffectParameter("x", "m", "forwards", -5.0, 5.0, 0.02),
-        EffectParameter("y", "m", "to the left", -5.0, 5.0, 0.02, default=0.0),
+        EffectParameter("x", "m", "forwards", -5.0, 5.0, 0.02, near_linear=True),
+        EffectParameter("y", "m", "to the left", -5.0, 5.0, 0.02, default=0.0, near_linear=True),
     ),
     sensors=("imu/data",),
     look_alikes=("imu_bias", "imu_scale"),

@@ -200,8 +200,8 @@ class ImuEffect(Effect):
     """An error of the IMU.
 
     Attributes:
-        measure: function (angular_velocity (3,) [rad/s], linear_acceleration (3,) [m/s^2], parameter values) -> both as the
-            IMU reports them.
+        measure: function (angular_velocity (..., 3) [rad/s], linear_acceleration (..., 3) [m/s^2], parameter values) -> both
+            as the IMU reports them.
     """
 
     measure: Callable[[FloatArray, FloatArray, Values], tuple[FloatArray, FloatArray]] = dataclasses.field(
@@ -214,7 +214,8 @@ class EncoderEffect(Effect):
     """An error of the angle that one joint of each targeted caster reports.
 
     Attributes:
-        measure: function (position (k,) [rad], velocity (k,) [rad/s], parameter values) -> both as they are reported.
+        measure: function (position [rad], velocity [rad/s], parameter values) -> both as they are reported, element by
+            element of arrays of one shape.
     """
 
     measure: Callable[[FloatArray, FloatArray, Values], tuple[FloatArray, FloatArray]] = dataclasses.field(

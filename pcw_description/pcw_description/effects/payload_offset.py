@@ -22,8 +22,8 @@ EFFECT = DescriptionEffect(
     summary="The load sits elsewhere than described: the centre of mass is displaced, and some wheels carry more than others.",
     sentence="The centre of mass is displaced by {x:+.3g} m forwards, {y:+.3g} m to the left and {z:+.3g} m upwards.",
     parameters=(
-        EffectParameter("x", "m", "forwards", -2.0, 2.0, 0.03),
-        EffectParameter("y", "m", "to the left", -2.0, 2.0, 0.03, default=0.0),
+        EffectParameter("x", "m", "forwards", -2.0, 2.0, 0.03, near_linear=True),
+        EffectParameter("y", "m", "to the left", -2.0, 2.0, 0.03, default=0.0, near_linear=True),
         EffectParameter("z", "m", "upwards", -2.0, 2.0, 0.05, default=0.0),
     ),
     sensors=("joint_states", "imu/data"),

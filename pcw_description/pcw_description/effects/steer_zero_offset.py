@@ -19,7 +19,7 @@ EFFECT = EncoderEffect(
     axis="steer",
     summary="The steering reads zero where the wheel does not point straight ahead.",
     sentence="The steering of {target} reads {offset:+.3g} rad more than the wheel's heading.",
-    parameters=(EffectParameter("offset", "rad", "reported minus true heading", -3.2, 3.2, 0.01),),
+    parameters=(EffectParameter("offset", "rad", "reported minus true heading", -3.2, 3.2, 0.01, near_linear=True),),
     sensors=("joint_states",),
     look_alikes=("caster_offset_error", "gear_backlash"),
     separating_experiment="drive straight in several directions and reverse: the robot drifts to the same side of its heading",

@@ -25,7 +25,7 @@ EFFECT = DescriptionEffect(
     axis="drive",
     summary="The rolling radius of the wheel is not the described one.",
     sentence="The rolling radius of {target} is {error:+.3g} m off.",
-    parameters=(EffectParameter("error", "m", "true minus described radius", -0.5, 0.5, 5e-4),),
+    parameters=(EffectParameter("error", "m", "true minus described radius", -0.5, 0.5, 5e-4, near_linear=True),),
     sensors=("joint_states", "imu/data", "ground_truth/odom"),
     look_alikes=("caster_offset_error", "imu_scale", "tyre_longitudinal_stiffness"),
     separating_experiment="drive straight over a measured distance",

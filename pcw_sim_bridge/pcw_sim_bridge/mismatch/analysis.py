@@ -143,7 +143,7 @@ def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance
     parameters = {}
     for name, estimate in named.estimates.items():
         declared = effect.parameter(name)
-        if declared.linear or declared.default is None:
+        if declared in effect.searched_parameters or declared.default is None or name in named.term.resolution:
             parameters[name] = ParameterFinding(estimate.value, subject.unit(declared.unit), estimate.low, estimate.high)
     return EffectFinding(
         name=named.term.effect,

@@ -217,7 +217,8 @@ class EffectSearch:
         term = self.problem.terms[instance.term]
         for name, (kind, spacing) in term.resolution.items():
             width = math.log(spacing) if kind == "log" else spacing
-            for _ in range(2):
+            before = -math.inf
+            for _ in range(2 if kind == "log" else 6):
                 best, best_evidence = instance, -math.inf
                 for offset in np.linspace(-1.0, 1.0, 7):
                     shape = dict(instance.shape)
@@ -226,14 +227,15 @@ class EffectSearch:
                         if kind == "log"
                         else shape[name] + offset * width
                     )
-                    if shape[name] <= 0.0:
-                        continue
                     trial = regression.with_shape(instance, shape)
                     evidence = regression.fit([*others, trial]).log_evidence
                     if evidence > best_evidence:
                         best, best_evidence = trial, evidence
                 instance = best
                 width *= 0.4
+                if best_evidence < before + 0.2:
+                    break
+                before = best_evidence
         return instance
 
     def improve(

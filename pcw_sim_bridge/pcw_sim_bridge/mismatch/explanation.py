@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from scipy import stats
@@ -243,7 +244,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             estimates[parameter.name] = Estimate(value, parameter.unit, value - half, value + half)
         others = fit.instances[:index] + fit.instances[index + 1 :]
         for name, value in instance.shape:
-            low, high = _profile(regression, others, instance, name, fit.log_evidence)
+            low, high = _profile(regression, others, instance, name, fit.log_evidence, term.resolution)
             estimates[name] = Estimate(value, "", low, high)
         columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         contribution = columns @ fit.mean[position : position + len(instance.active)]
@@ -265,21 +266,32 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
 
 
 def _profile(
-    regression: WhitenedRegression, others: tuple[Instance, ...], instance: Instance, name: str, best: float
+    regression: WhitenedRegression,
+    others: tuple[Instance, ...],
+    instance: Instance,
+    name: str,
+    best: float,
+    resolution: Mapping[str, tuple[str, float]],
 ) -> tuple[float, float]:
-    """95 % interval of a shaping parameter by its profile likelihood, on a logarithmic scale."""
+    """95 % interval of a shaping parameter by its profile likelihood: on the scale that it was searched on, or as it is."""
     centre = dict(instance.shape)[name]
-    if centre <= 0.0:
+    kind, spacing = resolution.get(name, ("", 0.0))
+    if not kind or (kind == "log" and centre <= 0.0):
         return centre, centre
+    widest = math.log(WIDEST_RATIO) if kind == "log" else 2.0 * spacing
+    smallest = 1e-4 if kind == "log" else 1e-4 * spacing
 
-    def drop(log_ratio: float) -> float:
-        shape = {**dict(instance.shape), name: centre * math.exp(log_ratio)}
+    def moved(step: float) -> float:
+        return centre * math.exp(step) if kind == "log" else centre + step
+
+    def drop(step: float) -> float:
+        shape = {**dict(instance.shape), name: moved(step)}
         return best - regression.fit([*others, regression.with_shape(instance, shape)]).log_evidence
 
     ends = []
     for direction in (-1.0, 1.0):
-        inner, outer = 0.0, 1e-4
-        while outer < math.log(WIDEST_RATIO) and drop(direction * outer) < DROP:
+        inner, outer = 0.0, smallest
+        while outer < widest and drop(direction * outer) < DROP:
             inner, outer = outer, outer * 3.0
         for _ in range(5):
             middle = math.sqrt(inner * outer) if inner > 0.0 else 0.5 * outer
@@ -287,7 +299,7 @@ def _profile(
                 inner = middle
             else:
                 outer = middle
-        ends.append(centre * math.exp(direction * min(outer, math.log(WIDEST_RATIO))))
+        ends.append(moved(direction * min(outer, widest)))
     return ends[0], ends[1]
 
 

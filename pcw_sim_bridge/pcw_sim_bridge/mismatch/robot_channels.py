@@ -7,15 +7,22 @@ nuisance column, and every effect a candidate; both by differences of the whole 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pcw_description.effects.kinds import DescriptionEffect, JointTorqueEffect
+from pcw_description.effects.effect import Effect
+from pcw_description.effects.kinds import (
+    ChassisForceEffect,
+    DescriptionEffect,
+    JointTorqueEffect,
+)
 from pcw_description.effects.registry import all_effects
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
 
+from ..plants.true_robot import as_it_really_is
 from .axis_channels import kernel_arguments
 from .errors import MismatchError
 from .regression_problem import (
@@ -28,8 +35,9 @@ from .regression_problem import (
     Shape,
     Term,
 )
+from .robot_effects import SEEN_KINDS, ChannelModel, Sides, with_yaw, without_reading_errors
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
-from .rolling_model import ModelNumbers, channel_sides, normal_forces, twists
+from .rolling_model import ModelNumbers, normal_forces, twists
 from .signal_filter import SignalFilter, derivative
 
 # Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
@@ -38,6 +46,11 @@ SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 # on their springs. Seen as the error of friction concealed in simulated robots, which is more of one sign than noise makes it.
 MODEL_DEVIATION = 0.007
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
+DIRECTIONS = 8  # of a grid over all directions
+# What a leftover may depend on that an effect of a kind explains.
+VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
+    DescriptionEffect: ("acceleration",), ChassisForceEffect: ("speed", "v_x", "v_y"),
+}  # fmt: skip
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
 
 
@@ -75,20 +88,11 @@ class RobotProblemBuilder:
                 "neither motor torques (effort in joint_states, of casters with an offset) nor imu/data were recorded; "
                 "nothing can be compared"
             )
-        self.numbers = ModelNumbers.of(self._with_nominal_changes(robot))
-
-    def _with_nominal_changes(self, robot: RobotDescription) -> RobotDescription:
-        """Effects that the description already holds belong to the nominal model."""
-        for instance in robot.physics:
-            effect = all_effects()[instance.name]
-            if isinstance(effect, DescriptionEffect):
-                robot = effect.apply(robot, instance.target, instance.parameters)
-        return robot
-
-    def _sides(
-        self, motion: RobotMotion, numbers: ModelNumbers, added_torque: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        return channel_sides(motion, numbers, self.balanced, self.has_imu, added_torque)
+        # Numbers that effects in the description already change belong to the nominal model.
+        described = as_it_really_is(robot)
+        self.numbers = ModelNumbers.of(described)
+        self.motions = with_yaw([without_reading_errors(robot, motion) for motion in self.motions], self.numbers)
+        self.model = ChannelModel(described, self.numbers, self.balanced, self.has_imu)
 
     def channels(self) -> tuple[Channel, ...]:
         """Channels that these recordings can fill."""
@@ -104,7 +108,7 @@ class RobotProblemBuilder:
 
     def build(self) -> RegressionProblem:
         """Return the regression problem of all recordings."""
-        sides = self._nominal = [self._sides(motion, self.numbers) for motion in self.motions]
+        sides = self._nominal = [self.model.sides(motion) for motion in self.motions]
         measured = self._filtered([np.nan_to_num(side[0]) for side in sides])
         predicted = self._filtered([side[1] for side in sides])
         residual = measured - predicted - self._known_effects(measured.shape[1])
@@ -122,7 +126,7 @@ class RobotProblemBuilder:
             residual=residual,
             valid=valid,
             nuisances=tuple(self._nuisances(sides)),
-            terms=tuple(self._terms(sides, measured)),
+            terms=tuple(self._terms(measured)),
             variables=self._variables(),
             scale_deviation=self._scale_deviation(),
         )
@@ -135,7 +139,7 @@ class RobotProblemBuilder:
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         return np.concatenate([f.apply(piece) for f, piece in zip(self.filters, pieces, strict=True)])
 
-    def _valid(self, sides: Sequence[tuple[FloatArray, FloatArray]]) -> BoolArray:
+    def _valid(self, sides: Sequence[Sides]) -> BoolArray:
         """Samples (T, C) that the rolling model can judge: moving, no gross slip, sensor there."""
         pieces = []
         numbers = self.numbers
@@ -154,25 +158,42 @@ class RobotProblemBuilder:
         return self._filtered([piece.astype(float) for piece in pieces]) < 0.1
 
     def _difference(
-        self, sides: Sequence[tuple[FloatArray, FloatArray]], numbers: ModelNumbers, step: float
+        self, sides: Sequence[Sides], numbers: ModelNumbers, step: float
     ) -> FloatArray:
         """Column (T, C) of a number: what the residual of the nominal model holds per unit of its deviation."""
         pieces = []
         for motion, (measured, predicted) in zip(self.motions, sides, strict=True):
-            changed_measured, changed_predicted = self._sides(motion, numbers)
+            changed_measured, changed_predicted = self.model.sides(motion, numbers)
             pieces.append(
                 np.nan_to_num(((measured - predicted) - (changed_measured - changed_predicted)) / step)
             )
         return self._filtered(pieces)
 
-    def _nuisances(self, sides: Sequence[tuple[FloatArray, FloatArray]]) -> list[Nuisance]:
+    def _nuisances(self, sides: Sequence[Sides]) -> list[Nuisance]:
         nuisances = []
         for name, unit, nominal, deviation, vary in self._deviations():
             numbers = copy.deepcopy(self.numbers)
             step = 0.5 * deviation
             vary(numbers, step)
             nuisances.append(Nuisance(name, unit, nominal, deviation, self._difference(sides, numbers, step)))
-        return nuisances
+        return nuisances + self._floor(sides)
+
+    def _floor(self, sides: Sequence[Sides]) -> list[Nuisance]:
+        """No floor is quite level: its inclination along both axes of the yaw."""
+        tolerance = self.robot.tolerance("ground.slope")
+        found = []
+        for k, axis_name in enumerate("xy"):
+            change = np.zeros(3)
+            change[k] = tolerance.value
+            pieces = []
+            for motion, (measured, predicted) in zip(self.motions, sides, strict=True):
+                leaning = measured.copy(), predicted.copy()
+                self.model.lean(motion, change, *leaning)
+                difference = (measured - predicted) - (leaning[0] - leaning[1])
+                pieces.append(np.nan_to_num(difference / tolerance.value))
+            column = self._filtered(pieces)
+            found.append(Nuisance(f"ground.slope.{axis_name}", tolerance.unit, 0.0, tolerance.value, column))
+        return found
 
     def _deviations(self) -> list[tuple[str, str, float, float, Callable[[ModelNumbers, float], None]]]:
         """Name, unit, nominal value, tolerance and variation of every number that a healthy robot may differ in."""
@@ -318,7 +339,7 @@ class RobotProblemBuilder:
                     torques[k, :, i, axis] = by_name[name]
             measured, predicted = nominal
             for k, scale in enumerate(scales):
-                with_effect = self._sides(motion, self.numbers, scale * torques[k])
+                with_effect = self.model.sides(motion, added_torque=scale * torques[k])
                 difference = (measured - predicted) - (with_effect[0] - with_effect[1])
                 columns[:, :, k] = np.nan_to_num(difference) / scale
             pieces.append(columns)
@@ -354,7 +375,7 @@ class RobotProblemBuilder:
         return self._normal_cache
 
     def _known_effects(self, width: int) -> FloatArray:
-        """What effects that the description already holds add to the residual, (T, C)."""
+        """What torques on joints that the description already holds add to the residual, (T, C)."""
         total = np.zeros(
             (sum(len(f.decimate(m.time)) for f, m in zip(self.filters, self.motions, strict=True)), width)
         )
@@ -367,24 +388,30 @@ class RobotProblemBuilder:
                 total += self._joint_columns(effect, casters, shape, instance.axis) @ weights
         return total
 
-    def _terms(self, sides: Sequence[tuple[FloatArray, FloatArray]], measured: FloatArray) -> list[Term]:
+    def _effect_difference(self, effect: Effect, target: Sequence[str], values: Mapping[str, float]) -> FloatArray:
+        """What an effect that is no torque on a joint adds to the residual, (T, C)."""
+        pieces = []
+        for motion, plain in zip(self.motions, self._nominal, strict=True):
+            changed = self.model.sides_with(motion, plain, effect, target, values)
+            pieces.append(np.nan_to_num((plain[0] - plain[1]) - (changed[0] - changed[1])))
+        return self._filtered(pieces)
+
+    def _terms(self, measured: FloatArray) -> list[Term]:
         if not self.balanced:
+            # Without forces nothing tells how much the wheels slip, and slip would be taken for an effect.
             return []
         terms = []
-        groups: list[tuple[tuple[str, ...], list[int]]] = [
-            ((name,), [i]) for i, name in enumerate(self.robot.caster_names)
-        ]
-        groups.append((self.robot.caster_names, list(range(self.robot.n))))
+        casters: list[tuple[str, ...]] = [*((name,) for name in self.robot.caster_names), self.robot.caster_names]
         size = np.sqrt(np.mean(measured[:, :3] ** 2))
         for effect in all_effects().values():
+            groups = casters if effect.target_kind == "caster" else [(effect.target_kind,)]
             if isinstance(effect, JointTorqueEffect):
                 shapes = self._shapes(effect)
-                if shapes is None:
-                    continue
-                for target, casters in groups:
-                    terms.append(self._joint_term(effect, target, casters, shapes, float(size)))
-            elif isinstance(effect, DescriptionEffect) and effect.target_kind == "chassis" and effect.linear_parameters:
-                terms.append(self._description_term(effect, sides))
+                for target in groups if shapes is not None else ():
+                    indices = [self.robot.caster_index(name) for name in target]
+                    terms.append(self._joint_term(effect, target, indices, shapes or (), float(size)))
+            elif isinstance(effect, SEEN_KINDS) and effect.searched_parameters:
+                terms += [term for target in groups if (term := self._difference_term(effect, target)) is not None]
         return terms
 
     def _shapes(self, effect: JointTorqueEffect) -> tuple[dict[str, float], ...] | None:
@@ -452,42 +479,60 @@ class RobotProblemBuilder:
             resolution={p.name: ("log", 2.15) for p in effect.nonlinear_parameters if p.default is None},
         )
 
-    def _description_term(
-        self, effect: DescriptionEffect, sides: Sequence[tuple[FloatArray, FloatArray]]
-    ) -> Term:
-        """A change of the description's numbers, linear in its first parameter for given shaping ones."""
-        linear = effect.linear_parameters[0]
-        reach = np.max(np.abs(self.robot.steer_axis), axis=0)
-        places = [
-            {"x": x * float(reach[0]), "y": y * float(reach[1])}
-            for x in (-0.7, 0.0, 0.7)
-            for y in (-0.7, 0.0, 0.7)
-        ]
-        defaults = {p.name: p.default for p in effect.nonlinear_parameters if p.default is not None}
-        free = {p.name for p in effect.nonlinear_parameters}
-        shapes = tuple({**defaults, **{k: v for k, v in place.items() if k in free}} for place in places)
+    def _difference_term(self, effect: Effect, target: tuple[str, ...]) -> Term | None:
+        """A candidate by differences of the whole channel model; None if no channel shows it."""
+        shapes, resolution = self._grid(effect)
+        if not shapes:
+            return None
+        searched = effect.searched_parameters
 
-        def columns(shape: Shape) -> FloatArray:
-            step = 0.1 * linear.typical
-            robot = effect.apply(
-                self._with_nominal_changes(self.robot), (effect.target_kind,), {**shape, linear.name: step}
-            )
-            return self._difference(sides, ModelNumbers.of(robot), step)[:, :, None]
+        def columns(shape: Shape, names: Sequence[str]) -> FloatArray:
+            none = {p.name: 0.0 for p in searched}
+            found = []
+            for name in names:
+                step = 0.1 * effect.parameter(name).typical
+                values = {**shape, **none, name: step}
+                found.append(self._effect_difference(effect, target, values) / step)
+            return np.stack(found, axis=2)
 
+        everything = columns(shapes[0], [p.name for p in searched])
+        shown = [p for k, p in enumerate(searched) if np.abs(everything[:, :, k]).max() > 0.0]
+        if not shown:
+            return None
+        names = [p.name for p in shown]
         return Term(
             effect=effect.name,
             log_prior=effect.log_prior,
-            target=(effect.target_kind,),
+            target=target,
             shapes=shapes,
-            columns=columns,
-            arguments=("acceleration",),
-            parameters=(
-                LinearParameter(linear.name, linear.unit, linear.lower, linear.upper, 3.0 * linear.typical),
-            ),
-            resolution={
-                name: ("linear", 0.35 * float(reach[k])) for k, name in enumerate("xy") if name in free
-            },
+            columns=lambda shape: columns(shape, names),
+            arguments=VARIABLES_OF.get(type(effect), ()),
+            parameters=tuple(LinearParameter(p.name, p.unit, p.lower, p.upper, 3.0 * p.typical) for p in shown),
+            resolution=resolution,
         )
+
+    def _grid(self, effect: Effect) -> tuple[tuple[dict[str, float], ...], dict[str, tuple[str, float]]]:
+        """Grid of the shaping parameters of an effect and its spacing; empty where there is none to search on.
+
+        Places on the robot and directions have one; everything else is left at its default.
+        """
+        reach = np.max(np.abs(self.robot.steer_axis), axis=0)
+        searched = {p.name for p in effect.searched_parameters}
+        shapes: list[dict[str, float]] = [{}]
+        resolution: dict[str, tuple[str, float]] = {}
+        for parameter in effect.parameters:
+            if parameter.name in searched:
+                continue
+            values = [parameter.default]
+            if parameter.name in ("x", "y"):
+                span = float(reach["xy".index(parameter.name)])
+                values = [-0.7 * span, 0.0, 0.7 * span]
+                resolution[parameter.name] = ("linear", 0.35 * span)
+            elif parameter.unit == "rad" and parameter.upper - parameter.lower > math.tau:
+                values = [k * math.tau / DIRECTIONS for k in range(DIRECTIONS)]
+                resolution[parameter.name] = ("linear", 0.5 * math.tau / DIRECTIONS)
+            shapes = [{**shape, parameter.name: value} for shape in shapes for value in values if value is not None]
+        return tuple(shapes), resolution
 
     def _variables(self) -> dict[str, FloatArray]:
         """What a leftover may depend on, each (T,)."""

@@ -35,6 +35,7 @@ class RobotMotion:
         sampling: interval of joint_states [s].
         position, velocity, acceleration, torque, torque_rate: joints (T, n, 2).
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
+        yaw: of base_link by a tracker (T,) [rad]; NaN where not recorded.
     """
 
     recording: int
@@ -47,6 +48,7 @@ class RobotMotion:
     torque: FloatArray
     torque_rate: FloatArray
     imu: FloatArray
+    yaw: FloatArray
 
 
 def read_motions(
@@ -101,9 +103,17 @@ def read_motions(
                     torque=torque[keep].copy(),
                     torque_rate=derivative(torque, rate)[keep].copy(),
                     imu=sensed[keep],
+                    yaw=_tracked_yaw(recording, stamps[start:stop][keep]),
                 )
             )
     return motions
+
+
+def _tracked_yaw(recording: Recording, stamps: FloatArray) -> FloatArray:
+    truth = recording.ground_truth
+    if truth is None or len(truth.stamp) < 2:
+        return np.full(len(stamps), np.nan)
+    return np.interp(stamps, truth.stamp, truth.pose[:, 2])
 
 
 def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> float:

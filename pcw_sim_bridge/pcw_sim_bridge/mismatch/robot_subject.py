@@ -16,10 +16,12 @@ from pcw_description.robot_description import STEER, RobotDescription
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
 from ..plants.reduced import ReducedPlant
+from ..plants.true_robot import as_it_really_is
 from .errors import MismatchError
 from .findings import InputFinding
 from .regression_problem import RegressionProblem
 from .robot_channels import RobotProblemBuilder
+from .robot_effects import without_reading_errors
 from .robot_motion import choose_cutoff, read_motions
 from .rolling_model import ModelNumbers, twists
 from .subject import Opened
@@ -98,7 +100,7 @@ class RobotSubject:
         recordings = [o.recording for o in opened]
         if self._cutoff is None:
             self._cutoff = choose_cutoff(self.robot, recordings)
-        numbers = ModelNumbers.of(self.robot)
+        numbers = ModelNumbers.of(as_it_really_is(self.robot))
         if np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3):
             return {}
         plant = ReducedPlant(self.robot, ROLLOUT_STEP)
@@ -106,7 +108,8 @@ class RobotSubject:
         for index, recording in enumerate(recordings):
             if recording.joint_states.effort is None:
                 return {}
-            for motion in read_motions(self.robot, recording, index, self._cutoff, with_torque=True):
+            for seen in read_motions(self.robot, recording, index, self._cutoff, with_torque=True):
+                motion = without_reading_errors(self.robot, seen)
                 angle = np.ascontiguousarray(motion.position[:, :, STEER])
                 twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
                 length = max(2, round(ROLLOUT_WINDOW * motion.rate))
