@@ -485,7 +485,7 @@ def test_relaxation_is_a_distance(plant_name):
 
 
 def test_scrub_brakes_a_turn_on_the_spot(plant_name):
-    """Each patch resists with mu F_z R s / sqrt(1 + s^2), s = sigma R / V / lambda_p; 3 %."""
+    """Each patch resists with mu F_z R s / sqrt(1 + s^2), s = sigma R / V / lambda_p; 10 %."""
     omega, patch = 1.0, 0.02
     accelerations = []
     for entries in ([], [{"name": "scrub_torque", "radius": patch}]):
