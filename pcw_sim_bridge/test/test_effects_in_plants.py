@@ -150,7 +150,7 @@ def test_viscous_friction_slows_exponentially(plant_name):
 
 @pytest.mark.parametrize("speed", [0.3, 1.0, 2.0])
 def test_stribeck_friction_fades_with_speed(plant_name, speed):
-    """1 %: the speed changes a little while it is measured."""
+    """2 %: the speed changes a little while it is measured."""
     stribeck, width = 0.2, 1.0
     with Rig(
         plant_name, {"name": "drive_stribeck_friction", "stribeck": stribeck, "stribeck_speed": width}, lifted=True
