@@ -65,36 +65,24 @@ def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def
     tau_rho, tau_phi, s_rr, s_rp, s_pp = 0.0, 0.0, 0.0, 0.0, 0.0
     on_motor_0, on_motor_1, motor_slope_0, motor_slope_1 = 0.0, 0.0, 0.0, 0.0
     for k in range(effects.joint_start[i], effects.joint_start[i + 1]):
-        place = effects.joint_place[k]
-        axis = place[0]
-        if place[1] == 1 and gears[i, axis, GEAR] > 0.0:
-            torque, slope = kernels[k](
-                gear_state[i, axis, ANGLE] + 0.5 * dt * gear_state[i, axis, RATE],
-                gear_state[i, axis, RATE],
-                wheel[MOTOR_RHO + axis],
-                normal,
-                numbers[k],
-            )
-            if axis == 0:
-                on_motor_0 += torque
-                motor_slope_0 += max(slope, 0.0)
-            else:
-                on_motor_1 += torque
-                motor_slope_1 += max(slope, 0.0)
-            continue
-        torque, slope = kernels[k](
-            wheel[RHO + axis] + 0.5 * dt * wheel[RHO_DOT + axis],
-            wheel[RHO_DOT + axis],
-            wheel[MOTOR_RHO + axis],
-            normal,
-            numbers[k],
-        )
-        if axis == 0:
+        axis = effects.joint_place[k, 0]
+        on_motor = effects.joint_place[k, 1] == 1 and gears[i, axis, GEAR] > 0.0
+        angle = gear_state[i, axis, ANGLE] if on_motor else wheel[RHO + axis]
+        rate = gear_state[i, axis, RATE] if on_motor else wheel[RHO_DOT + axis]
+        torque, slope = kernels[k](angle + 0.5 * dt * rate, rate, wheel[MOTOR_RHO + axis], normal, numbers[k])
+        slope = max(slope, 0.0)
+        if on_motor and axis == 0:
+            on_motor_0 += torque
+            motor_slope_0 += slope
+        elif on_motor:
+            on_motor_1 += torque
+            motor_slope_1 += slope
+        elif axis == 0:
             tau_rho += torque
-            s_rr += max(slope, 0.0)
+            s_rr += slope
         else:
             tau_phi += torque
-            s_pp += max(slope, 0.0)
+            s_pp += slope
     if gears[i, 0, GEAR] == 0.0 and gears[i, 1, GEAR] == 0.0:
         return tau_rho + wheel[MOTOR_RHO], tau_phi + wheel[MOTOR_PHI], s_rr, s_rp, s_pp
     # Torques of the motors, each on its own shaft, joint side: tau = E^T u with the rows E of the coupling.
