@@ -110,10 +110,31 @@ def _kernel_list(signature: str, functions: Sequence[Callable[..., Any]]) -> Any
     return typed_list
 
 
-@compiled
-def joint_torque_along(kernels, position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
-    """Evaluate the first kernel of a `joint_torque_list` along arrays (T,); returns (T,) [N m]."""
-    kernel = kernels[0]
+def compiled_for_kernel(kernel_signature: str, result: str, arguments: str) -> Callable[[Function], Function]:
+    """Compile a function whose first argument is a kernel of a common signature, once for all kernels of it.
+
+    Args:
+        kernel_signature: of the kernel.
+        result, arguments: types of what the function returns and of what it takes after the kernel.
+    """
+
+    def decorate(function: Function) -> Function:
+        if not COMPILES:
+            return function
+        kernel_arguments, kernel_result = numba.core.sigutils.normalize_signature(kernel_signature)
+        kernel = numba.types.FunctionType(kernel_result(*kernel_arguments))
+        others, returned = numba.core.sigutils.normalize_signature(f"{result}({arguments})")
+        dispatcher: Any = compiled(function)
+        dispatcher.compile(returned(kernel, *others))
+        dispatcher.disable_compile()
+        return dispatcher  # type: ignore[no-any-return]
+
+    return decorate
+
+
+@compiled_for_kernel(JOINT_TORQUE_SIGNATURE, "float64[::1]", ", ".join(5 * ["float64[::1]"]))
+def joint_torque_along(kernel, position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
+    """Evaluate a joint-torque kernel along arrays (T,); returns (T,) [N m]."""
     torque = position.copy()
     for index in range(len(position)):
         torque[index], _ = kernel(

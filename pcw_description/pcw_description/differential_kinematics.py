@@ -39,29 +39,24 @@ def wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle):  # type: igno
 
 
 @compiled
-def forward_kinematics_kernel(steer_axis, caster_offset, wheel_radius, steer_angle, joint_velocity):  # type: ignore[no-untyped-def]
-    """Return twist (3,), slip (n, 2) and (A^T A)^-1 (3, 3): the closed form of A^+ B q_dot.
+def rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
+    """Return A^+ w (3,), what of w contradicts it (n, 2) and (A^T A)^-1 (3, 3), of velocities w (n, 2) in the wheel frames.
 
     The wheel centres move like a rigid body in the plane, so the least-squares twist is the one of a planar
     registration: rotation from the moments about the centroid, translation from the means.
     """
     n = len(steer_angle)
     centre = np.empty((n, 2))
-    sensed = np.empty((n, 2))
     mean_px, mean_py, mean_wx, mean_wy = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         c, s = math.cos(steer_angle[i]), math.sin(steer_angle[i])
         bx, by = caster_offset[i, 0], caster_offset[i, 1]
         centre[i, 0] = steer_axis[i, 0] + bx * c - by * s
         centre[i, 1] = steer_axis[i, 1] + bx * s + by * c
-        along = wheel_radius[i] * joint_velocity[i, 0] + by * joint_velocity[i, 1]
-        across = -bx * joint_velocity[i, 1]
-        sensed[i, 0] = along
-        sensed[i, 1] = across
         mean_px += centre[i, 0] / n
         mean_py += centre[i, 1] / n
-        mean_wx += (c * along - s * across) / n
-        mean_wy += (s * along + c * across) / n
+        mean_wx += (c * sensed[i, 0] - s * sensed[i, 1]) / n
+        mean_wy += (s * sensed[i, 0] + c * sensed[i, 1]) / n
     moment, spread = 0.0, 0.0
     for i in range(n):
         c, s = math.cos(steer_angle[i]), math.sin(steer_angle[i])
@@ -90,6 +85,16 @@ def forward_kinematics_kernel(steer_axis, caster_offset, wheel_radius, steer_ang
     normal_inverse[0, 2] = normal_inverse[2, 0] = mean_py / spread
     normal_inverse[1, 2] = normal_inverse[2, 1] = -mean_px / spread
     return twist, slip, normal_inverse
+
+
+@compiled
+def forward_kinematics_kernel(steer_axis, caster_offset, wheel_radius, steer_angle, joint_velocity):  # type: ignore[no-untyped-def]
+    """Return twist (3,), slip (n, 2) and (A^T A)^-1 (3, 3): the closed form of A^+ B q_dot."""
+    sensed = np.empty((len(steer_angle), 2))
+    for i in range(len(steer_angle)):
+        sensed[i, 0] = wheel_radius[i] * joint_velocity[i, 0] + caster_offset[i, 1] * joint_velocity[i, 1]
+        sensed[i, 1] = -caster_offset[i, 0] * joint_velocity[i, 1]
+    return rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed)
 
 
 def wheel_jacobian(robot: RobotDescription, steer_angle: FloatArray) -> FloatArray:

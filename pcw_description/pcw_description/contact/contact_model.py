@@ -28,6 +28,9 @@ TYRE_SIZE = 13
 
 # Damping of the bristles at standstill [s]; see the module's docstring. A fifth of critical for a 20 kg wheel load.
 DAMPING_TIME = 0.002
+# The inverse of a friction curve stops at this part of its peak; so many steps of the secant bring it there to a percent,
+# and at half the peak to 1e-5.
+GREATEST_USE, INVERSION_STEPS = 0.95, 12
 # Below this rolling speed turning on the spot counts as full scrub [m/s].
 SCRUB_SPEED = 0.05
 
@@ -88,6 +91,27 @@ def friction_coefficient(tyre, longitudinal_slip, lateral_slip):  # type: ignore
     """
     along, across = _secant_slopes(tyre, longitudinal_slip, lateral_slip)
     return along * longitudinal_slip, across * lateral_slip
+
+
+@compiled
+def slip_of_force(tyre, force_x, force_y, normal_force):  # type: ignore[no-untyped-def]
+    """Return the steady slips (longitudinal, lateral) [1] under a force in the wheel frame [N]; the inverse of the curves.
+
+    On their rising branch: a force beyond the peak of friction is taken as GREATEST_USE of it. Of the LuGre model only the
+    bristles are inverted, which is its slope at small slip.
+    """
+    along, across = tyre[A], tyre[LATERAL_A]
+    x, y = force_x / normal_force, force_y / normal_force
+    if int(tyre[MODEL]) == _LUGRE:
+        return x / along, y / across
+    use = math.sqrt((x / tyre[MU]) ** 2 + (y / tyre[LATERAL_MU]) ** 2)
+    if use > GREATEST_USE:
+        x, y = x * GREATEST_USE / use, y * GREATEST_USE / use
+    slip_x, slip_y = 0.0, 0.0
+    for _ in range(INVERSION_STEPS):
+        along, across = _secant_slopes(tyre, slip_x, slip_y)
+        slip_x, slip_y = x / along, y / across
+    return slip_x, slip_y
 
 
 @compiled

@@ -28,6 +28,9 @@ class EffectParameter:
         default: used when the description leaves the parameter out; None if it must be given.
         linear: the contribution is proportional to this parameter (all linear parameters together are additive).
         near_linear: it is so near zero, where the effect vanishes with it; its derivative there tells how the effect shows.
+        reciprocal: its inverse is so: the effect vanishes as the parameter grows.
+        neutral: of a near-linear parameter that is neutral at the described value instead of zero: where in the
+            description that stands, as "contact.relaxation_length".
     """
 
     name: str
@@ -39,6 +42,8 @@ class EffectParameter:
     default: float | None = None
     linear: bool = False
     near_linear: bool = False
+    reciprocal: bool = False
+    neutral: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +92,7 @@ class Effect:
     @property
     def searched_parameters(self) -> tuple[EffectParameter, ...]:
         """The parameters whose size, beginning at none, a derivative can find."""
-        return tuple(parameter for parameter in self.parameters if parameter.linear or parameter.near_linear)
+        return tuple(parameter for parameter in self.parameters if parameter.linear or parameter.near_linear or parameter.reciprocal)
 
     @property
     def nonlinear_parameters(self) -> tuple[EffectParameter, ...]:

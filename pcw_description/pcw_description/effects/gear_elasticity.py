@@ -19,7 +19,7 @@ EFFECT = TransmissionEffect(
     summary="The gear twists under torque, so that motor and joint swing against each other.",
     sentence="The gear in the {joint} of {target} twists by one radian per {stiffness:.4g} N m.",
     parameters=(
-        EffectParameter("stiffness", "N m/rad", "torque per twist, joint side", 1.0, 1e7, 500.0),
+        EffectParameter("stiffness", "N m/rad", "torque per twist, joint side", 1.0, 1e7, 500.0, reciprocal=True),
         EffectParameter("damping", "N m s/rad", "damping of the twist, joint side", 0.0, 1e4, 0.5, default=0.5),
     ),
     sensors=("joint_states",),

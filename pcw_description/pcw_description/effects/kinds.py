@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import joint_torque_along, joint_torque_list
+from ..compiled import joint_torque_along
 from ..robot_description import RobotDescription
 from .effect import Effect, FloatArray
 
@@ -89,7 +89,7 @@ class JointTorqueEffect(Effect):
     ) -> FloatArray:
         """Evaluate the kernel along a recording; all arrays (T,), result (T,) [N m]."""
         q, v, tau, load = (np.ascontiguousarray(a, dtype=float) for a in (position, velocity, motor_torque, normal_force))
-        torque: FloatArray = joint_torque_along(joint_torque_list([self.torque]), q, v, tau, load, self.values(parameters))
+        torque: FloatArray = joint_torque_along(self.torque, q, v, tau, load, self.values(parameters))
         return torque
 
     def regressor(

@@ -25,7 +25,7 @@ EFFECT = DescriptionEffect(
     axis="steer",
     summary="The tyre is stiffer or softer across than described; its peak friction is the same, at another slip.",
     sentence="The tyre of {target} is stiffer across by {error:+.3g} of the described stiffness.",
-    parameters=(EffectParameter("error", "1", "relative error of the stiffness", -0.9, 10.0, 0.3),),
+    parameters=(EffectParameter("error", "1", "relative error of the stiffness", -0.9, 10.0, 0.3, near_linear=True),),
     sensors=("joint_states", "imu/data", "ground_truth/odom"),
     look_alikes=("tyre_relaxation", "caster_offset_error"),
     separating_experiment="drive fast curves both ways, at several speeds",

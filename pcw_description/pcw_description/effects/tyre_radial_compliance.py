@@ -22,7 +22,7 @@ EFFECT = ContactEffect(
     summary="The tyre flattens under load, and a third of its deflection is missing from the rolling radius.",
     sentence="The tyre of {target} has {stiffness:.4g} N/m of radial stiffness; the described radius holds at {load:.4g} N.",
     parameters=(
-        EffectParameter("stiffness", "N/m", "load per deflection of the tyre", 1e4, 1e9, 1e5),
+        EffectParameter("stiffness", "N/m", "load per deflection of the tyre", 1e4, 1e9, 1e5, reciprocal=True),
         EffectParameter("load", "N", "load under which the described radius holds", 0.0, 1e5, 200.0, default=0.0),
     ),
     sensors=("joint_states", "imu/data", "ground_truth/odom"),

@@ -134,7 +134,7 @@ def effect_instance(named: NamedTerm) -> EffectInstance:
     values |= {name: estimate.value for name, estimate in named.estimates.items()}
     # Rounding of an estimate at its bound must not make a file that its own reader refuses.
     bounded = {p.name: min(max(values[p.name], p.lower), p.upper) for p in effect.parameters}
-    return EffectInstance(named.term.effect, named.term.target, bounded)
+    return EffectInstance(named.term.effect, named.term.target, bounded, named.term.axis)
 
 
 def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance) -> EffectFinding:
@@ -202,7 +202,7 @@ def _location(explanation: Explanation, named: NamedTerm) -> LocationFinding:
     return LocationFinding(
         channels=tuple(problem.channels[c].name for c in channels),
         casters=named.term.target if effect.target_kind == "caster" and named.term.target != ("axis",) else (),
-        axis=effect.axis,
+        axis=named.term.axis or effect.axis,
         intervals=_intervals(problem.time[active], problem.recording[active]),
         region=region,
     )

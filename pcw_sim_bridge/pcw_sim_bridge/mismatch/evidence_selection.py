@@ -111,8 +111,13 @@ class EffectSearch:
         threshold = self.calibrate(regression, instances)
         return self.prune(regression, instances, threshold)
 
-    def whiten_at(self, residual: FloatArray, white: bool = False) -> WhitenedRegression:
-        """Whiten the problem by the noise of a residual (T, C)."""
+    def channel_deviations(self, residual: FloatArray) -> FloatArray:
+        """Standard deviation of every channel of a residual (T, C), outliers held down, (C,)."""
+        valid = self.problem.valid
+        return np.array([robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])])
+
+    def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
+        """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
         problem = self.problem
         if white:
             noise = white_noise_model(residual, problem.valid)
@@ -121,8 +126,11 @@ class EffectSearch:
         weights = np.ones_like(residual)
         for channel in range(residual.shape[1]):
             values = residual[:, channel]
-            weights[:, channel] = huber_weights(values / robust_deviation(values[problem.valid[:, channel]]))
-        return WhitenedRegression(problem, noise, weights, self.block)
+            deviation = robust_deviation(values[problem.valid[:, channel]])
+            weights[:, channel] = problem.channels[channel].information * huber_weights(values / deviation)
+            if problem.misjudged is not None:
+                weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
+        return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)
 
     def residual_of(self, instances: Sequence[Instance]) -> FloatArray:
         """Residual (T, C) of the least-squares fit of a set, with robust weights."""
@@ -140,7 +148,7 @@ class EffectSearch:
         Every residual that still holds a large effect looks like strong slow noise, under which nothing could be found.
         """
         instances: tuple[Instance, ...] = ()
-        regression = self.whiten_at(self.problem.residual, white=True)
+        regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
         while len(instances) < self.settings.largest_set:
             step = self.best_addition(regression, instances)
             if step is None or step.gain < self.settings.lenient_gain:
@@ -149,7 +157,7 @@ class EffectSearch:
                 break
             instances = (*instances, self.refine_shape(regression, instances, step.instance))
             instances = self.improve(regression, instances)
-            regression = self.whiten_at(self.residual_of(instances), white=True)
+            regression.rescale(self.channel_deviations(regression.unwhitened_residual(regression.fit(instances))))
         return instances
 
     def thin(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:

@@ -241,7 +241,8 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             parameter = term.parameters[parameter_index]
             value = float(fit.mean[position + offset])
             half = HALF_WIDTH * math.hypot(float(deviation[position + offset]), problem.scale_deviation * value)
-            estimates[parameter.name] = Estimate(value, parameter.unit, value - half, value + half)
+            low, high = parameter.interval(value - half, value + half)
+            estimates[parameter.name] = Estimate(parameter.value(value), parameter.unit, low, high)
         others = fit.instances[:index] + fit.instances[index + 1 :]
         for name, value in instance.shape:
             low, high = _profile(regression, others, instance, name, fit.log_evidence, term.resolution)

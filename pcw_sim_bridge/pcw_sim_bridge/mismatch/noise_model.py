@@ -17,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy import sparse
 
 from .regression_problem import BoolArray, FloatArray, IntArray, segment_slices
 
@@ -44,15 +45,12 @@ class NoiseModel:
         """Filter (T, C) or (T, C, K) channel by channel; the first `memory` samples of a segment become NaN."""
         memory = self.memory
         result = np.full(values.shape, np.nan)
-        extra = (1,) * (values.ndim - 2)
         for piece in segment_slices(segment):
             block = values[piece]
             if len(block) <= memory:
                 continue
-            out = self.taps[:, 0].reshape(1, -1, *extra) * block[memory:]
-            for lag in range(1, memory + 1):
-                out += self.taps[:, lag].reshape(1, -1, *extra) * block[memory - lag : len(block) - lag]
-            result[piece.start + memory : piece.stop] = out
+            for channel, taps in enumerate(self.taps):
+                result[piece.start + memory : piece.stop, channel] = _convolution(taps, len(block)) @ block[:, channel]
         return result
 
     def usable(self, valid: BoolArray, segment: IntArray) -> BoolArray:
@@ -83,10 +81,16 @@ class NoiseModel:
             rows = np.flatnonzero(codes == code)
             present = np.flatnonzero(usable[rows[0]])
             root = np.linalg.cholesky(self.correlation[np.ix_(present, present)])
-            block = np.moveaxis(filtered[np.ix_(rows, present)], 1, 0)
-            solved = np.linalg.solve(root, block.reshape(len(present), -1)).reshape(block.shape)
-            white[np.ix_(rows, present)] = np.moveaxis(solved, 0, 1)
+            decorrelated = np.linalg.inv(root) @ filtered[np.ix_(rows, present)].reshape(len(rows), len(present), -1)
+            white[np.ix_(rows, present)] = decorrelated.reshape(len(rows), len(present), *values.shape[2:])
         return white
+
+
+def _convolution(taps: FloatArray, count: int) -> sparse.csr_array:
+    """Matrix (count - L + 1, count) that filters with taps (L,) where the whole filter has samples."""
+    rows = count - len(taps) + 1
+    diagonals = np.repeat(taps[::-1][:, None], count, axis=1)
+    return sparse.dia_array((diagonals, np.arange(len(taps))), shape=(rows, count)).tocsr()
 
 
 def huber_weights(standardised: FloatArray) -> FloatArray:

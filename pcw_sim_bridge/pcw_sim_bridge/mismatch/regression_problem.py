@@ -27,12 +27,18 @@ Shape = Mapping[str, float]  # values of the shaping parameters of one candidate
 
 @dataclasses.dataclass(frozen=True)
 class Channel:
-    """One residual signal, by its public name (INTERFACES section 6)."""
+    """One residual signal, by its public name (INTERFACES section 6).
+
+    Attributes:
+        casters: it belongs to; axis: "drive", "steer", "chassis", "imu" or "clock".
+        information: part of its samples' information that no other channel holds too.
+    """
 
     name: str
     unit: str
     casters: tuple[str, ...] = ()
     axis: str = "chassis"
+    information: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +60,13 @@ class Nuisance:
 
 @dataclasses.dataclass(frozen=True)
 class LinearParameter:
-    """A parameter the columns are proportional to; a fit outside [lower, upper] is no explanation.
+    """A parameter whose regression coefficient the columns belong to; a coefficient outside [lower, upper] is no explanation.
 
     Attributes:
+        lower, upper, deviation: bounds and prior deviation of the coefficient.
         refinement: zero unless there is evidence for it; not part of the effect when it is first named.
+        origin: value of the parameter where the coefficient is zero.
+        reciprocal: the coefficient is the inverse of the parameter.
     """
 
     name: str
@@ -66,6 +75,19 @@ class LinearParameter:
     upper: float
     deviation: float
     refinement: bool = False
+    origin: float = 0.0
+    reciprocal: bool = False
+
+    def value(self, coefficient: float) -> float:
+        """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""
+        if self.reciprocal:
+            return 1.0 / max(coefficient, 1e-12)
+        return self.origin + coefficient
+
+    def interval(self, low: float, high: float) -> tuple[float, float]:
+        """Return the parameter's interval for one of the coefficient."""
+        first, last = self.value(low), self.value(high)
+        return min(first, last), max(first, last)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +97,7 @@ class Term:
     Attributes:
         effect: name in the vocabulary.
         target: casters, ("chassis",), ("axis",) ...
+        axis: "drive" or "steer" for an effect that can stand at either joint.
         parameters: the linear ones.
         shapes: the grid of shaping parameters to begin with; one empty mapping where there are none.
         columns: shape -> (T, C, len(parameters)), the contribution to the residual per unit of each parameter.
@@ -83,6 +106,7 @@ class Term:
         resolution: spacing of `shapes` per shaping parameter; local search stays within it.
         scan: cheaper, slightly inexact columns of all `shapes` at once, (T, C, len(shapes), len(parameters)), where the
             grid is long; None uses `columns`.
+        grid_size: how many shapes `shapes` were chosen from, where a first look has narrowed them down.
         log_prior: of the effect (see there), part of every evidence.
     """
 
@@ -95,12 +119,15 @@ class Term:
     repeatable: bool = False
     resolution: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
     scan: Callable[[], FloatArray] | None = None
+    grid_size: int = 0
     log_prior: float = 0.0
+    axis: str | None = None
 
     @property
     def key(self) -> str:
         """Short label for logs and tables."""
-        return f"{self.effect}/{'+'.join(self.target)}"
+        place = f"{self.axis} of " if self.axis else ""
+        return f"{self.effect}/{place}{'+'.join(self.target)}"
 
     def base_indices(self) -> tuple[int, ...]:
         """Positions of the parameters that are not refinements."""
@@ -119,6 +146,7 @@ class RegressionProblem:
         measured: the measured side of each channel (T, C), for error ratios; residual = measured - predicted.
         valid: samples that may be judged (T, C).
         variables: what a leftover may depend on: name -> (T,).
+        misjudged: standard deviation of what the model itself misjudges in each sample, besides noise (T, C); None: of none.
         scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
             known no better, and an effect that is no larger is not told from it.
     """
@@ -134,6 +162,7 @@ class RegressionProblem:
     nuisances: tuple[Nuisance, ...]
     terms: tuple[Term, ...]
     variables: Mapping[str, FloatArray]
+    misjudged: FloatArray | None = None
     scale_deviation: float = 0.0
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False

@@ -1,10 +1,8 @@
-"""What a robot's channels would be with an effect at work that is not a torque on a joint.
+"""What a robot's channels would be with an effect at work.
 
-The effect's own function is called where it acts: on the description, on what was read, on what gravity and other forces
-do. The difference to the channels without it, per unit of a parameter, is the effect's column; nothing is derived by hand.
-
-Effects that act between command and motor, in a gear, or at a place of the ground do not show in these channels, or not by a
-derivative, and are left to others.
+The effect's own function is called where it acts: on the description, on what was read, in a gear, under a wheel, on a
+joint, on what gravity and other forces do. The difference to the channels without it, per unit of a parameter, is the
+effect's column; nothing is derived by hand. What acts between a command and the motor's torque shows in `command_tracking`.
 """
 
 from __future__ import annotations
@@ -14,154 +12,298 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pcw_description.compiled import ARRAY_SIGNATURE, compiled_for_kernel
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.effect import Effect
 from pcw_description.effects.kinds import (
     COM_X,
     COM_Y,
     COM_Z,
+    CONTACT_INPUTS,
+    CONTACT_RESULTS,
+    CONTACT_TIME,
+    CONTACT_X,
+    CONTACT_Y,
     FORCE_INPUTS,
     FORCE_TIME,
+    FRICTION,
+    GRADIENT_X,
+    GRADIENT_Y,
+    LOAD,
+    POSE_X,
+    POSE_YAW,
+    RADIUS_CHANGE,
+    RADIUS_SLOPE,
+    ROLL_ANGLE,
     TWIST_X,
     TWIST_YAW,
     ChassisForceEffect,
     ClockEffect,
+    ContactEffect,
     DescriptionEffect,
     EncoderEffect,
+    Gear,
     GravityEffect,
     ImuEffect,
+    JointTorqueEffect,
+    TransmissionEffect,
 )
 from pcw_description.effects.registry import get
-from pcw_description.robot_description import AXIS_NAMES, GRAVITY, STEER, RobotDescription
+from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER, RobotDescription
 
 from .regression_problem import FloatArray
 from .robot_motion import RobotMotion
-from .rolling_model import ModelNumbers, channel_sides, twists
-from .signal_filter import derivative
+from .rolling_model import (
+    NOTHING,
+    ChannelLayout,
+    ModelNumbers,
+    Surroundings,
+    acceleration_of,
+    channel_sides,
+    normal_forces,
+    twists,
+)
+from .signal_filter import SignalFilter, derivative
 
 Sides = tuple[FloatArray, FloatArray]
-SEEN_KINDS = (DescriptionEffect, EncoderEffect, ImuEffect, ClockEffect, GravityEffect, ChassisForceEffect)
+# A gear's play changes sides as its torque passes zero, over this part of the torque's size: below it is noise.
+PLAY_TORQUE = 0.02
 
 
-def with_yaw(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
-    """Return the motions with a yaw everywhere: where none was tracked, from the wheels, zero where a recording begins.
+def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
+    """Return the motions with a pose everywhere: where none was tracked, from the wheels, zero where a recording begins.
 
-    Over a gap the yaw rate goes in a line from its last value to its next.
+    Over a gap the twist goes in a line from its last value to its next.
     """
     found: list[RobotMotion] = []
-    last_rate = 0.0
+    last_rate = np.zeros(3)
     for motion in motions:
-        if np.isfinite(motion.yaw).all():
+        if np.isfinite(motion.pose).all():
             found.append(motion)
             continue
-        angle = np.ascontiguousarray(motion.position[:, :, STEER])
-        rate = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)[0][:, 2]
-        start = 0.0
+        twist = twists(numbers, motion.position[:, :, STEER], motion.velocity)[0]
+        pose = np.zeros((len(twist), 3))
         if found and found[-1].recording == motion.recording:
-            start = found[-1].yaw[-1] + 0.5 * (last_rate + rate[0]) * (motion.time[0] - found[-1].time[-1])
-        steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(motion.time)
-        found.append(dataclasses.replace(motion, yaw=start + np.concatenate([[0.0], np.cumsum(steps)])))
-        last_rate = rate[-1]
+            pose[0] = found[-1].pose[-1] + 0.5 * (last_rate + twist[0]) * (motion.time[0] - found[-1].time[-1])
+        steps = np.diff(motion.time)
+        pose[:, 2] = pose[0, 2] + _integral(twist[:, 2], steps)
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        pose[:, 0] = pose[0, 0] + _integral(c * twist[:, 0] - s * twist[:, 1], steps)
+        pose[:, 1] = pose[0, 1] + _integral(s * twist[:, 0] + c * twist[:, 1], steps)
+        found.append(dataclasses.replace(motion, pose=pose))
+        last_rate = np.array([c[-1] * twist[-1, 0] - s[-1] * twist[-1, 1], s[-1] * twist[-1, 0] + c[-1] * twist[-1, 1], twist[-1, 2]])
     return found
+
+
+def _integral(values: FloatArray, steps: FloatArray) -> FloatArray:
+    """Integrate (T,) over steps (T - 1,) by trapezoids, from zero."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * steps)])
+
+
+def normal_along(motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:
+    """Normal forces (T, n) [N] along a motion."""
+    angle = np.ascontiguousarray(motion.position[:, :, STEER])
+    twist, _ = twists(numbers, angle, motion.velocity)
+    return normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)))
 
 
 def with_true_angles(
     robot: RobotDescription,
     motion: RobotMotion,
-    effect: EncoderEffect,
+    effect: EncoderEffect | TransmissionEffect,
     target: Sequence[str],
     values: Mapping[str, float],
     axis: str | None,
 ) -> RobotMotion:
-    """Return the motion with the error of its readings taken back, to first order."""
+    """Return the motion of the joints themselves: errors of reading, and what gears give way, taken back to first order."""
     position, velocity = motion.position.copy(), motion.velocity.copy()
+    acceleration = motion.acceleration
     column = AXIS_NAMES.index(axis or effect.axis)
     for name in target:
         i = robot.caster_index(name)
-        seen = motion.position[:, i, column], motion.velocity[:, i, column]
-        again = effect.measure(*seen, values)
-        position[:, i, column] -= again[0] - seen[0]
-        velocity[:, i, column] -= again[1] - seen[1]
-    return dataclasses.replace(motion, position=position, velocity=velocity)
+        if isinstance(effect, EncoderEffect):
+            seen = motion.position[:, i, column], motion.velocity[:, i, column]
+            again = effect.measure(*seen, values)
+            position[:, i, column] -= again[0] - seen[0]
+            velocity[:, i, column] -= again[1] - seen[1]
+        else:
+            if acceleration is motion.acceleration:
+                acceleration = acceleration.copy()
+            ahead = _wind_up(robot, motion, i, column, effect.gear(values))
+            position[:, i] -= ahead
+            rate = derivative(ahead, motion.rate)
+            velocity[:, i] -= rate
+            acceleration[:, i] -= derivative(rate, motion.rate)
+    return dataclasses.replace(motion, position=position, velocity=velocity, acceleration=acceleration)
 
 
-def without_reading_errors(robot: RobotDescription, motion: RobotMotion) -> RobotMotion:
-    """Return the motion without the errors of readings that the robot's `physics` hold."""
+def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, gear: Gear) -> FloatArray:
+    """How far the readings of caster i are ahead of its joints through a gear (T, 2) [rad], drive and steer."""
+    diagonal = np.diag(robot.gear_matrix[i])
+    coupling = robot.gear_matrix[i] / diagonal[:, None]
+    rotors = robot.casters[i].rotors
+    rotor = (rotors.drive, rotors.steer)[axis] * diagonal[axis] ** 2
+    shaft = motion.torque[:, i] @ np.linalg.inv(coupling)
+    torque = shaft[:, axis] - rotor * (motion.acceleration[:, i] @ coupling[axis])
+    ahead = torque / gear.stiffness
+    if gear.play > 0.0:
+        size = max(PLAY_TORQUE * float(np.sqrt(np.mean(torque**2))), 1e-9)
+        ahead = ahead + 0.5 * gear.play * np.clip(torque / size, -1.0, 1.0)
+    smooth = SignalFilter(motion.rate, motion.cutoff).smooth(ahead)
+    moved: FloatArray = smooth[:, None] * np.linalg.inv(coupling)[:, axis]
+    return moved
+
+
+def true_motion(robot: RobotDescription, motion: RobotMotion) -> RobotMotion:
+    """Return the motion without the errors of readings, and the give of gears, that the robot's `physics` hold."""
     for instance in robot.physics:
         effect = get(instance.name)
-        if isinstance(effect, EncoderEffect):
+        if isinstance(effect, (EncoderEffect, TransmissionEffect)):
             motion = with_true_angles(robot, motion, effect, instance.target, instance.parameters, instance.axis)
     return motion
 
 
+@compiled_for_kernel(
+    ARRAY_SIGNATURE, "float64[:, ::1]", "float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[::1]"
+)
+def _contacts_along(kernel, values, time, place, roll_angle, load):  # type: ignore[no-untyped-def]
+    """Results (T, CONTACT_RESULTS) of a contact's kernel under one wheel that is at place (T, 2)."""
+    found = np.zeros((len(time), CONTACT_RESULTS))
+    at = np.zeros(CONTACT_INPUTS)
+    for t in range(len(time)):
+        found[t, FRICTION] = 1.0
+        at[CONTACT_TIME], at[CONTACT_X], at[CONTACT_Y] = time[t], place[t, 0], place[t, 1]
+        at[ROLL_ANGLE], at[LOAD] = roll_angle[t], load[t]
+        kernel(at, values, found[t])
+    return found
+
+
 @dataclasses.dataclass(frozen=True)
 class ChannelModel:
-    """The channels of one robot as it is described, the effects of its `physics` at work but for torques on joints.
+    """The channels of one robot as it is described, the effects of its `physics` at work.
 
     Attributes:
         robot: with the numbers that its effects change already changed.
         numbers: of that robot.
-        balanced: whether there are channels of forces; has_imu: whether there are those of an IMU.
+        layout: which channels there are.
     """
 
     robot: RobotDescription
     numbers: ModelNumbers
-    balanced: bool
-    has_imu: bool
+    layout: ChannelLayout
 
-    def sides(
-        self, motion: RobotMotion, numbers: ModelNumbers | None = None, added_torque: FloatArray | None = None
-    ) -> Sides:
-        """Measured and predicted side of every channel along a motion without errors of reading, (T, C) each."""
-        sides = channel_sides(motion, numbers or self.numbers, self.balanced, self.has_imu, added_torque)
+    def around(self, motion: RobotMotion) -> Surroundings:
+        """What the robot's `physics` add on joints and under wheels along a motion."""
+        around = NOTHING
+        for instance in self.robot.physics:
+            around = self.around_with(motion, around, instance)
+        return around
+
+    def around_with(self, motion: RobotMotion, around: Surroundings, instance: EffectInstance) -> Surroundings:
+        """Return the surroundings with a further effect on joints or under wheels; others change nothing here."""
+        effect = get(instance.name)
+        if not isinstance(effect, (JointTorqueEffect, ContactEffect)):
+            return around
+        shape = motion.position.shape
+        torque = np.zeros(shape) if around.torque is None else around.torque.copy()
+        normal = normal_along(motion, self.numbers)
+        if isinstance(effect, JointTorqueEffect):
+            axis = AXIS_NAMES.index(instance.axis or effect.axis)
+            for name in instance.target:
+                i = self.robot.caster_index(name)
+                signals = (motion.position, motion.velocity, motion.torque)
+                torque[:, i, axis] += effect.contribution(
+                    *(signal[:, i, axis] for signal in signals), normal[:, i], instance.parameters
+                )
+            return dataclasses.replace(around, torque=torque)
+        radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
+        grip = np.ones(shape[:2]) if around.grip is None else around.grip.copy()
+        for name in instance.target:
+            i = self.robot.caster_index(name)
+            found = self._under_wheel(motion, effect, i, instance.parameters, normal)
+            radius[:, i] += found[:, RADIUS_CHANGE]
+            grip[:, i] *= found[:, FRICTION]
+            torque[:, i, DRIVE] -= normal[:, i] * found[:, RADIUS_SLOPE]
+            torque[:, i, DRIVE] += self._climbing(motion, i, normal[:, i], found)
+        return Surroundings(torque, radius, grip)
+
+    def wheel_places(self, motion: RobotMotion, i: int) -> FloatArray:
+        """Centre of wheel i in the world (T, 2) [m]."""
+        c, s = np.cos(motion.position[:, i, STEER]), np.sin(motion.position[:, i, STEER])
+        (bx, by), (sx, sy) = self.numbers.caster_offset[i], self.numbers.steer_axis[i]
+        x, y = sx + bx * c - by * s, sy + bx * s + by * c
+        c, s = np.cos(motion.pose[:, 2]), np.sin(motion.pose[:, 2])
+        places: FloatArray = motion.pose[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
+        return places
+
+    def _under_wheel(
+        self, motion: RobotMotion, effect: ContactEffect, i: int, values: Mapping[str, float], normal: FloatArray
+    ) -> FloatArray:
+        found: FloatArray = _contacts_along(
+            effect.contact, effect.values(values), motion.time, self.wheel_places(motion, i),
+            np.ascontiguousarray(motion.position[:, i, DRIVE]), np.ascontiguousarray(normal[:, i]),
+        )  # fmt: skip
+        return found
+
+    def _climbing(self, motion: RobotMotion, i: int, normal: FloatArray, found: FloatArray) -> FloatArray:
+        """Drive torque (T,) that would push like a wheel's load on a slope of the ground; the side force is in the steering's."""
+        heading = motion.pose[:, 2] + motion.position[:, i, STEER]
+        slope = np.cos(heading) * found[:, GRADIENT_X] + np.sin(heading) * found[:, GRADIENT_Y]
+        torque: FloatArray = -self.numbers.radius[i] * normal * slope
+        return torque
+
+    def sides(self, motion: RobotMotion, around: Surroundings, numbers: ModelNumbers | None = None) -> Sides:
+        """Measured and predicted side of every channel along a true motion, (T, C) each."""
+        sides = channel_sides(motion, numbers or self.numbers, self.layout, around)
         for instance in self.robot.physics:
             self._apply(motion, get(instance.name), instance.parameters, *sides)
         return sides
 
-    def sides_with(
-        self, motion: RobotMotion, plain: Sides, effect: Effect, target: Sequence[str], values: Mapping[str, float]
-    ) -> Sides:
-        """The same with an effect at work.
+    def sides_with(self, motion: RobotMotion, around: Surroundings, plain: Sides, instance: EffectInstance) -> Sides:
+        """The same with a further effect at work.
 
         Args:
-            motion: the motion.
+            motion: the true motion; around: what is at work already.
             plain: the sides without the effect.
-            effect: one of `SEEN_KINDS`.
-            target: where it is.
-            values: all its parameters.
+            instance: the effect, with all its parameters.
         """
+        effect = get(instance.name)
         if isinstance(effect, DescriptionEffect):
-            return self.sides(motion, ModelNumbers.of(effect.apply(self.robot, target, values)))
-        if isinstance(effect, EncoderEffect):
-            return self.sides(with_true_angles(self.robot, motion, effect, target, values, None))
+            changed = effect.apply(self.robot, instance.target, instance.parameters)
+            return self.sides(motion, around, ModelNumbers.of(changed))
+        if isinstance(effect, (EncoderEffect, TransmissionEffect)):
+            place = instance.target, instance.parameters, instance.axis
+            return self.sides(with_true_angles(self.robot, motion, effect, *place), around)
+        if isinstance(effect, (JointTorqueEffect, ContactEffect)):
+            return self.sides(motion, self.around_with(motion, around, instance))
         sides = plain[0].copy(), plain[1].copy()
-        self._apply(motion, effect, values, *sides)
+        self._apply(motion, effect, instance.parameters, *sides)
         return sides
 
     def _apply(
         self, motion: RobotMotion, effect: Effect, values: Mapping[str, float], measured: FloatArray, predicted: FloatArray
     ) -> None:
-        """Change both sides as an effect on forces, gravity, IMU or its clock does; other kinds change nothing here."""
-        if isinstance(effect, ChassisForceEffect) and self.balanced:
+        """Change both sides as an effect on forces, gravity, IMU or clocks does; other kinds change nothing here."""
+        layout = self.layout
+        if isinstance(effect, ChassisForceEffect) and layout.balanced:
             wrench = effect.contribution(self._at(motion), values)
             measured[:, :3] += wrench[:, [0, 1, 5]]
         elif isinstance(effect, GravityEffect):
             self.lean(motion, effect.gravity(values), measured, predicted)
-        elif isinstance(effect, ImuEffect) and self.has_imu:
-            sensed = predicted[:, -3:]
+        elif isinstance(effect, ImuEffect) and layout.imu:
+            sensed = predicted[:, layout.inertial]
             zero = np.zeros(len(sensed))
             rate, acceleration = effect.measure(
                 np.column_stack([zero, zero, sensed[:, 0]]), np.column_stack([sensed[:, 1:], zero + GRAVITY]), values
             )
-            predicted[:, -3:] = np.column_stack([rate[:, 2], acceleration[:, :2]])
-        elif isinstance(effect, ClockEffect) and self.has_imu:
+            predicted[:, layout.inertial] = np.column_stack([rate[:, 2], acceleration[:, :2]])
+        elif isinstance(effect, ClockEffect):
             # What bears the stamp t was sensed the offset earlier: what was sensed at t bears t + offset.
-            measured[:, -3:] += effect.offset("imu/data", values) * derivative(motion.imu, motion.rate)
-
-    def _twist(self, motion: RobotMotion) -> FloatArray:
-        numbers = self.numbers
-        angle = np.ascontiguousarray(motion.position[:, :, STEER])
-        twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
-        return twist
+            if layout.imu:
+                measured[:, layout.inertial] += effect.offset("imu/data", values) * derivative(motion.imu, motion.rate)
+            if layout.pose:
+                offset = effect.offset("ground_truth/odom", values)
+                measured[:, layout.tracked] += offset * derivative(motion.tracked_twist, motion.rate)
 
     def _mass_and_centre(self) -> tuple[float, FloatArray]:
         """Mass of the whole robot [kg] and its centre (3,) [m], the casters' modules at their axes."""
@@ -175,7 +317,8 @@ class ChannelModel:
     def _at(self, motion: RobotMotion) -> FloatArray:
         at = np.zeros((len(motion.time), FORCE_INPUTS))
         at[:, FORCE_TIME] = motion.time
-        at[:, TWIST_X : TWIST_YAW + 1] = self._twist(motion)
+        at[:, POSE_X : POSE_YAW + 1] = motion.pose
+        at[:, TWIST_X : TWIST_YAW + 1] = twists(self.numbers, motion.position[:, :, STEER], motion.velocity)[0]
         at[:, [COM_X, COM_Y, COM_Z]] = self._mass_and_centre()[1]
         return at
 
@@ -197,14 +340,14 @@ class ChannelModel:
     def lean(self, motion: RobotMotion, change: FloatArray, measured: FloatArray, predicted: FloatArray) -> None:
         """Change both sides as gravity does whose unit vector leans by `change` (3,), in the axes of the yaw."""
         pull = GRAVITY * change
-        c, s = np.cos(motion.yaw), np.sin(motion.yaw)
+        c, s = np.cos(motion.pose[:, 2]), np.sin(motion.pose[:, 2])
         along, across = c * pull[0] + s * pull[1], c * pull[1] - s * pull[0]
-        if self.balanced:
+        if self.layout.balanced:
             mass, centre = self._mass_and_centre()
             measured[:, 0] += mass * along
             measured[:, 1] += mass * across
             measured[:, 2] += mass * (centre[0] * across - centre[1] * along)
             measured[:, :3] += self._held_by_steering(motion, along, across)
-        if self.has_imu:
-            predicted[:, -2] -= along
-            predicted[:, -1] -= across
+        if self.layout.imu:
+            predicted[:, self.layout.inertial.start + 1] -= along
+            predicted[:, self.layout.inertial.start + 2] -= across

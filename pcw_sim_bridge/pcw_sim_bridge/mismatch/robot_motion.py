@@ -23,6 +23,7 @@ MOTION_OVERSAMPLING = 5.0
 TYRE_MARGIN = 0.5
 ALLOWED_DERIVATIVE_NOISE = 0.05
 LARGEST_GAP = 0.05  # [s]
+LARGEST_TRACKER_GAP = 0.25  # [s]; trackers are slower than joints
 SHORTEST_SEGMENT = 1.0  # [s]
 
 
@@ -31,15 +32,17 @@ class RobotMotion:
     """One contiguous piece on a regular grid after the wide filter; arrays along T.
 
     Attributes:
-        rate: [Hz].
+        rate: [Hz]; cutoff: of the wide filter [Hz].
         sampling: interval of joint_states [s].
         position, velocity, acceleration, torque, torque_rate: joints (T, n, 2).
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
-        yaw: of base_link by a tracker (T,) [rad]; NaN where not recorded.
+        pose: of base_link by a tracker (T, 3); NaN where not recorded.
+        tracked_twist: its velocity in base_link (T, 3); NaN where not recorded.
     """
 
     recording: int
     rate: float
+    cutoff: float
     sampling: float
     time: FloatArray
     position: FloatArray
@@ -48,7 +51,8 @@ class RobotMotion:
     torque: FloatArray
     torque_rate: FloatArray
     imu: FloatArray
-    yaw: FloatArray
+    pose: FloatArray
+    tracked_twist: FloatArray
 
 
 def read_motions(
@@ -74,7 +78,7 @@ def read_motions(
             imu[:, column] = np.interp(
                 joints.stamp, recording.imu.stamp, measured[:, column], left=np.nan, right=np.nan
             )
-    signals = np.concatenate([signals, imu], axis=1)
+    signals = np.concatenate([signals, imu, _tracked_pose(recording, joints.stamp)], axis=1)
     rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
     step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
@@ -91,29 +95,49 @@ def read_motions(
             torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
             keep = slice(None, None, step)
             sensed = np.where(np.isfinite(block[:, 4 * n :]), smooth[:, 4 * n :], np.nan)
+            pose = sensed[:, 3:]
             motions.append(
                 RobotMotion(
                     recording=index,
                     rate=rate / step,
+                    cutoff=wide.cutoff,
                     sampling=1.0 / rate,
-                    time=stamps[start:stop][keep],
+                    time=stamps[start:stop][keep].copy(),
                     position=position[keep].copy(),
                     velocity=velocity[keep].copy(),
                     acceleration=derivative(velocity, rate)[keep].copy(),
                     torque=torque[keep].copy(),
                     torque_rate=derivative(torque, rate)[keep].copy(),
-                    imu=sensed[keep],
-                    yaw=_tracked_yaw(recording, stamps[start:stop][keep]),
+                    imu=sensed[keep, :3],
+                    pose=pose[keep].copy(),
+                    tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),
                 )
             )
     return motions
 
 
-def _tracked_yaw(recording: Recording, stamps: FloatArray) -> FloatArray:
+def _tracked_pose(recording: Recording, stamps: FloatArray) -> FloatArray:
+    """Tracked pose (T, 3) at the stamps of the joints, its yaw without jumps; NaN where it was not recorded."""
     truth = recording.ground_truth
+    pose = np.full((len(stamps), 3), np.nan)
     if truth is None or len(truth.stamp) < 2:
-        return np.full(len(stamps), np.nan)
-    return np.interp(stamps, truth.stamp, truth.pose[:, 2])
+        return pose
+    tracked = truth.pose.copy()
+    tracked[:, 2] = np.unwrap(tracked[:, 2])
+    for column in range(3):
+        pose[:, column] = np.interp(stamps, truth.stamp, tracked[:, column], left=np.nan, right=np.nan)
+    # Over a pause of the tracker there is no pose, however near a line may come to it.
+    pauses = np.flatnonzero(np.diff(truth.stamp) > LARGEST_TRACKER_GAP)
+    for index in pauses:
+        pose[(stamps > truth.stamp[index]) & (stamps < truth.stamp[index + 1])] = np.nan
+    return pose
+
+
+def _in_body(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Turn a velocity (T, 3) in the world into base_link."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    along, across = c * velocity[:, 0] + s * velocity[:, 1], c * velocity[:, 1] - s * velocity[:, 0]
+    return np.stack([along, across, velocity[:, 2]], axis=1)
 
 
 def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> float:

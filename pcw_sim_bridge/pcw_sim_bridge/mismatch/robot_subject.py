@@ -21,7 +21,7 @@ from .errors import MismatchError
 from .findings import InputFinding
 from .regression_problem import RegressionProblem
 from .robot_channels import RobotProblemBuilder
-from .robot_effects import without_reading_errors
+from .robot_effects import true_motion
 from .robot_motion import choose_cutoff, read_motions
 from .rolling_model import ModelNumbers, twists
 from .subject import Opened
@@ -109,9 +109,9 @@ class RobotSubject:
             if recording.joint_states.effort is None:
                 return {}
             for seen in read_motions(self.robot, recording, index, self._cutoff, with_torque=True):
-                motion = without_reading_errors(self.robot, seen)
+                motion = true_motion(self.robot, seen)
                 angle = np.ascontiguousarray(motion.position[:, :, STEER])
-                twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
+                twist, _ = twists(numbers, angle, motion.velocity)
                 length = max(2, round(ROLLOUT_WINDOW * motion.rate))
                 steps = max(1, round(1.0 / (motion.rate * ROLLOUT_STEP)))
                 for start in range(0, len(motion.time) - length, length):

@@ -1,17 +1,20 @@
-"""The channels of a robot on powered casters: what its encoders, motors and inertial sensor say that the model does not.
+"""The channels of a robot on powered casters: what its encoders, motors and other sensors say that the model does not.
 
     chassis_force/x|y, chassis_torque/z    H[A^T F] - H[m a of chassis and modules]        motors against motion
+    rolling_consistency/<caster>_...       H[P B q_dot] - H[P eps]                         wheels against one another
     gyro                                   H[omega_imu] - H[omega]
     accelerometer/x|y                      H[a_imu] - H[acceleration at the sensor]
+    pose/x|y|yaw                           H[velocity of the tracked pose] - H[V]          in base_link
 
-with H the same filter on both sides. Each joint's own balance gives the force at its contact,
+with H the same filter on both sides and P = 1 - A A^+. Each joint's own balance gives the force at its contact,
 
     r F_x = tau_rho - I_rho rho_ddot - J_rp phi_ddot
-    b_x F_y - b_y F_x = m c x a_c + I sigma_dot + J_pp phi_ddot + J_rp rho_ddot - tau_phi
+    b_x F_y - b_y F_x = m c x a_c + I sigma_dot + J_pp phi_ddot + J_rp rho_ddot - tau_phi - M_scrub
 
 and the tyre under that force slips: eps = |V_w| lambda(F) + L d lambda / dt, the relaxed slip solved for eps. The robot's
 twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a missing force of a tenth of
-the whole, growing with frequency; the channels end well below the resonance of the robot on its tyres.
+the whole, growing with frequency; the channels end well below the resonance of the robot on its tyres. Where no torques
+were recorded, the forces are those that the motion asks of the wheels, shared as evenly as can be.
 
 Every number of the description that a healthy robot may differ in is a nuisance column, by differences of the whole
 model; so is every effect. Robots whose wheels have no offset along their heading (b_x = 0) have no torque balance here.
@@ -25,13 +28,90 @@ import numpy as np
 
 from pcw_description.augmented_object_model import dynamic_parameters
 from pcw_description.compiled import compiled
-from pcw_description.differential_kinematics import forward_kinematics_kernel
+from pcw_description.contact.contact_model import (
+    DAMPING_TIME,
+    LENGTH,
+    scrub_torque,
+    slip_of_force,
+    tyre_parameters,
+)
+from pcw_description.differential_kinematics import rigid_motion_kernel, wheel_jacobian_kernel
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
 
 from ..plants.support_forces import support_forces
-from .regression_problem import FloatArray
+from .regression_problem import Channel, FloatArray
 from .robot_motion import RobotMotion
 from .signal_filter import derivative
+
+WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelLayout:
+    """Which channels there are, and at which columns.
+
+    Attributes:
+        casters: names.
+        balanced: motor torques and an offset along the heading: there is a balance of forces.
+        imu: an inertial sensor; pose: a tracked pose.
+    """
+
+    casters: tuple[str, ...]
+    balanced: bool
+    imu: bool
+    pose: bool
+
+    @property
+    def consistency(self) -> slice:
+        """Columns of `rolling_consistency`, longitudinal and lateral by caster."""
+        start = 3 if self.balanced else 0
+        return slice(start, start + 2 * len(self.casters))
+
+    @property
+    def inertial(self) -> slice:
+        """Columns of gyro and accelerometer; empty without an IMU."""
+        start = self.consistency.stop
+        return slice(start, start + (3 if self.imu else 0))
+
+    @property
+    def tracked(self) -> slice:
+        """Columns of the pose; empty without a tracker."""
+        start = self.inertial.stop
+        return slice(start, start + (3 if self.pose else 0))
+
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels in order."""
+        found = [Channel(name, "N m" if "torque" in name else "N") for name in WRENCH] if self.balanced else []
+        # 2n slips of which a twist makes three: each sample tells so much less than its numbers.
+        share = (2.0 * len(self.casters) - 3.0) / (2.0 * len(self.casters))
+        for caster in self.casters:
+            for axis, direction in (("drive", "longitudinal"), ("steer", "lateral")):
+                name = f"rolling_consistency/{caster}_{direction}"
+                found.append(Channel(name, "m/s", (caster,), axis, information=share))
+        if self.imu:
+            found.append(Channel("gyro", "rad/s", axis="imu"))
+            found += [Channel(f"accelerometer/{axis}", "m/s^2", axis="imu") for axis in "xy"]
+        if self.pose:
+            found += [Channel(f"pose/{axis}", "rad/s" if axis == "yaw" else "m/s") for axis in ("x", "y", "yaw")]
+        return tuple(found)
+
+
+@dataclasses.dataclass(frozen=True)
+class Surroundings:
+    """What an effect adds along a motion besides changed numbers; None where it adds nothing.
+
+    Attributes:
+        torque: on the joints besides the motors' (T, n, 2) [N m].
+        radius: change of the rolling radius (T, n) [m].
+        grip: factor on the friction under each wheel (T, n).
+    """
+
+    torque: FloatArray | None = None
+    radius: FloatArray | None = None
+    grip: FloatArray | None = None
+
+
+NOTHING = Surroundings()
 
 
 @dataclasses.dataclass
@@ -44,8 +124,7 @@ class ModelNumbers:
         steer_zero: error of the measured headings (n,) [rad].
         gain: true over reported motor torque (n, 2).
         imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
-        slip: slip at the contact per nominal slip of the tyre.
-        critical_slip, peak_friction, relaxation_length: of the nominal tyre.
+        tyres: numbers of the tyres (n, TYRE_SIZE); softness: slip at the contact per slip of these (n, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
     """
 
@@ -61,10 +140,8 @@ class ModelNumbers:
     gyro_bias: float
     gyro_scale: float
     accelerometer_bias: FloatArray
-    slip: float
-    critical_slip: float
-    peak_friction: float
-    relaxation_length: float
+    tyres: FloatArray
+    softness: FloatArray
     torque_lag: float
 
     @classmethod
@@ -85,37 +162,53 @@ class ModelNumbers:
             gyro_bias=0.0,
             gyro_scale=1.0,
             accelerometer_bias=np.zeros(2),
-            slip=1.0,
-            critical_slip=robot.contact.lambda_p,
-            peak_friction=robot.contact.mu_p,
-            relaxation_length=robot.contact.relaxation_length,
+            tyres=np.array([tyre_parameters(tyre) for tyre in robot.tyres]),
+            softness=np.ones((robot.n, 2)),
             torque_lag=0.0,
         )
 
 
 @compiled
-def twists(steer_axis, caster_offset, radius, steer_angle, velocity):  # type: ignore[no-untyped-def]
-    """Wheels' twist (T, 3) and largest consistency slip (T,) of joint motion (T, n), (T, n, 2)."""
-    count = len(steer_angle)
-    twist = np.empty((count, 3))
-    slip = np.empty(count)
-    for t in range(count):
-        twist[t], residual, _ = forward_kinematics_kernel(
-            steer_axis, caster_offset, radius, steer_angle[t], velocity[t]
-        )
-        slip[t] = np.sqrt(np.max(residual[:, 0] ** 2 + residual[:, 1] ** 2))
-    return twist, slip
+def _rigid_motions(steer_axis, caster_offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
+    twist = np.empty((len(sensed), 3))
+    contradiction = np.empty_like(sensed)
+    for t in range(len(sensed)):
+        twist[t], contradiction[t], _ = rigid_motion_kernel(steer_axis, caster_offset, steer_angle[t], sensed[t])
+    return twist, contradiction
+
+
+def rigid_motions(numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Split velocities (T, n, 2) in the wheel frames into the twist A^+ w (T, 3) and what contradicts it (T, n, 2)."""
+    found: tuple[FloatArray, FloatArray] = _rigid_motions(
+        numbers.steer_axis, numbers.caster_offset, np.ascontiguousarray(steer_angle), velocity
+    )
+    return found
+
+
+def rolling_velocities(numbers: ModelNumbers, velocity: FloatArray) -> FloatArray:
+    """Velocities B q_dot (T, n, 2) of the wheel centres in the wheel frames that joint rates (T, n, 2) make without slip."""
+    offset_x, offset_y = numbers.caster_offset[:, 0], numbers.caster_offset[:, 1]
+    along = numbers.radius * velocity[:, :, DRIVE] + offset_y * velocity[:, :, STEER]
+    return np.stack([along, -offset_x * velocity[:, :, STEER]], axis=2)
+
+
+def twists(numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Wheels' twist (T, 3) and what of each wheel's motion contradicts it (T, n, 2) [m/s], of joint rates (T, n, 2)."""
+    return rigid_motions(numbers, steer_angle, rolling_velocities(numbers, velocity))
 
 
 @compiled
 def _contact_forces(  # type: ignore[no-untyped-def]
-    modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, twist, twist_dot
+    modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, spin, twist, twist_dot
 ):
-    """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N]."""
+    """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N].
+
+    radius, spin: rolling radius [m] and torque of the ground about the vertical [N m] of each wheel (T, n).
+    """
     force = np.empty_like(torque)
     for t in range(len(torque)):
         vx, vy, omega = twist[t, 0], twist[t, 1], twist[t, 2]
-        for i in range(len(radius)):
+        for i in range(torque.shape[1]):
             c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
             m, cx, cy = modules[i, 0], modules[i, 1], modules[i, 2]
             lever_x, lever_y = cx * c - cy * s, cx * s + cy * c
@@ -141,12 +234,13 @@ def _contact_forces(  # type: ignore[no-untyped-def]
             roll_inertia = modules[i, 4] + modules[i, 5]
             along = (
                 torque[t, i, 0] - roll_inertia * acceleration[t, i, 0] - modules[i, 6] * acceleration[t, i, 1]
-            ) / radius[i]
+            ) / radius[t, i]
             turning = m * (lever_x * ay - lever_y * ax) + modules[i, 3] * sigma_dot
             turning += (
                 modules[i, 7] * acceleration[t, i, 1]
                 + modules[i, 6] * acceleration[t, i, 0]
                 - torque[t, i, 1]
+                - spin[t, i]
             )
             force[t, i, 0] = along
             force[t, i, 1] = (turning + caster_offset[i, 1] * along) / caster_offset[i, 0]
@@ -154,8 +248,8 @@ def _contact_forces(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _wrench_of(steer_axis, caster_offset, steer_angle, force):  # type: ignore[no-untyped-def]
-    """Wrench A^T F on the base (T, 3) of contact forces (T, n, 2)."""
+def _wrench_of(steer_axis, caster_offset, steer_angle, force, spin):  # type: ignore[no-untyped-def]
+    """Wrench on the base (T, 3) of contact forces (T, n, 2) and of torques about the vertical (T, n)."""
     wrench = np.zeros((len(force), 3))
     for t in range(len(force)):
         for i in range(steer_angle.shape[1]):
@@ -167,7 +261,7 @@ def _wrench_of(steer_axis, caster_offset, steer_angle, force):  # type: ignore[n
             gx, gy = c * fx - s * fy, s * fx + c * fy
             wrench[t, 0] += gx
             wrench[t, 1] += gy
-            wrench[t, 2] += px * gy - py * gx
+            wrench[t, 2] += px * gy - py * gx + spin[t, i]
     return wrench
 
 
@@ -236,110 +330,117 @@ def normal_forces(numbers: ModelNumbers, steer_angle: FloatArray, acceleration: 
     return forces
 
 
-def slip_twist(
-    motion: RobotMotion,
-    numbers: ModelNumbers,
-    steer_angle: FloatArray,
-    twist: FloatArray,
-    force: FloatArray,
-) -> FloatArray:
-    """Twist (T, 3) that the wheels show beyond the robot's: A^+ of the slip that carries the contact forces.
+@compiled
+def _shared_forces(steer_axis, caster_offset, steer_angle, wrench):  # type: ignore[no-untyped-def]
+    """Smallest contact forces (T, n, 2) in the wheel frames that make a wrench (T, 3): A (A^T A)^-1 w."""
+    force = np.zeros((len(wrench), len(steer_axis), 2))
+    for t in range(len(wrench)):
+        _, _, normal_inverse = rigid_motion_kernel(steer_axis, caster_offset, steer_angle[t], force[t])
+        flat = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle[t]) @ (normal_inverse @ wrench[t])
+        for i in range(len(steer_axis)):
+            force[t, i, 0], force[t, i, 1] = flat[2 * i], flat[2 * i + 1]
+    return force
 
-    The force is inverted through the rising branch of Kiencke's curve, lambda = lambda_p m / (1 + sqrt(1 - m^2)) with
-    m = F / (mu_p F_z); all curves share its slope to first order.
-    """
-    twist_dot = derivative(twist, motion.rate)
-    acceleration = twist_dot[:, :2] + twist[:, 2:] * np.stack([-twist[:, 1], twist[:, 0]], axis=1)
-    normal = np.maximum(normal_forces(numbers, steer_angle, acceleration), 1.0)
-    use = np.clip(force / (numbers.peak_friction * normal[:, :, None]), -0.99, 0.99)
-    ratio = numbers.slip * numbers.critical_slip * use / (1.0 + np.sqrt(1.0 - use**2))
-    rolling = np.hypot(
-        motion.velocity[:, :, DRIVE] * numbers.radius,
-        motion.velocity[:, :, STEER] * numbers.caster_offset[:, 0],
-    )
-    slip = rolling[:, :, None] * ratio + numbers.relaxation_length * derivative(ratio, motion.rate)
-    # A^+ of slips is A^+ B of the joint rates that would look like them.
-    as_rates = np.empty_like(slip)
-    as_rates[:, :, STEER] = slip[:, :, 1] / -numbers.caster_offset[:, 0]
-    as_rates[:, :, DRIVE] = (
-        slip[:, :, 0] - numbers.caster_offset[:, 1] * as_rates[:, :, STEER]
-    ) / numbers.radius
-    slip_twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, steer_angle, as_rates)
-    result: FloatArray = slip_twist
+
+@compiled
+def _slip_ratios(tyres, softness, force, grip):  # type: ignore[no-untyped-def]
+    """Steady slip ratios (T, n, 2) under forces (T, n, 2) [N] on wheels of load times friction factor grip (T, n) [N]."""
+    ratio = np.empty_like(force)
+    for t in range(len(force)):
+        for i in range(force.shape[1]):
+            along, across = slip_of_force(tyres[i], force[t, i, 0], force[t, i, 1], grip[t, i])
+            ratio[t, i, 0], ratio[t, i, 1] = softness[i, 0] * along, softness[i, 1] * across
+    return ratio
+
+
+@compiled
+def _scrub(tyres, turn_rate, speed, grip):  # type: ignore[no-untyped-def]
+    """Torques of the ground on the wheels about the vertical (T, n) [N m]."""
+    torque = np.empty_like(turn_rate)
+    for t in range(len(turn_rate)):
+        for i in range(turn_rate.shape[1]):
+            torque[t, i] = scrub_torque(tyres[i], turn_rate[t, i], speed[t, i], grip[t, i])
+    return torque
+
+
+def acceleration_of(twist: FloatArray, twist_dot: FloatArray) -> FloatArray:
+    """Acceleration (T, 2) of base_link's origin in its own axes [m/s^2]."""
+    return twist_dot[:, :2] + twist[:, 2:] * np.stack([-twist[:, 1], twist[:, 0]], axis=1)
+
+
+def slips(
+    numbers: ModelNumbers, rate: float, speed: FloatArray, force: FloatArray, grip: FloatArray
+) -> FloatArray:
+    """Slip velocities (T, n, 2) [m/s] of tyres under forces (T, n, 2), at rolling speeds and loads (T, n)."""
+    ratio = _slip_ratios(numbers.tyres, numbers.softness, force, grip)
+    ratio = ratio - DAMPING_TIME * derivative(ratio, rate)
+    result: FloatArray = speed[:, :, None] * ratio + numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
     return result
 
 
 def channel_sides(
-    motion: RobotMotion,
-    numbers: ModelNumbers,
-    wrench: bool,
-    imu: bool,
-    added_torque: FloatArray | None = None,
+    motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
 ) -> tuple[FloatArray, FloatArray]:
     """Measured and predicted side of every channel at the motion's rate, (T, C) each.
 
     Args:
         motion: the motion.
         numbers: of the model.
-        wrench: whether the channels of the wrench are wanted; imu: likewise those of the inertial sensor.
-        added_torque: acts on the joints besides the motors' (T, n, 2) [N m].
+        layout: which channels are wanted.
+        around: what else is at work.
     """
     steer_angle = np.ascontiguousarray(motion.position[:, :, STEER]) + numbers.steer_zero
     geometry = numbers.steer_axis, numbers.caster_offset
-    twist, _ = twists(*geometry, numbers.radius, steer_angle, motion.velocity)
-    measured, predicted = [], []
-    if wrench:
+    velocity, radius = motion.velocity, np.broadcast_to(numbers.radius, steer_angle.shape)
+    if around.radius is not None:
+        radius = radius + around.radius
+        velocity = velocity.copy()
+        velocity[:, :, DRIVE] *= radius / numbers.radius
+    radius = np.ascontiguousarray(radius)
+    twist, contradiction = twists(numbers, steer_angle, velocity)
+    twist_dot = derivative(twist, motion.rate)
+    normal = normal_forces(numbers, steer_angle, acceleration_of(twist, twist_dot))
+    grip = np.maximum(normal if around.grip is None else normal * around.grip, 1.0)
+    speed = np.abs(velocity[:, :, DRIVE] * numbers.radius)
+    turn_rate = velocity[:, :, STEER] + twist[:, 2:]
+    spin = _scrub(numbers.tyres, turn_rate, speed, grip)
+
+    def inertial_wrench() -> FloatArray:
+        wrench: FloatArray = _inertial_wrench(
+            numbers.chassis, numbers.modules, numbers.steer_axis, steer_angle,
+            np.ascontiguousarray(velocity[:, :, STEER]), np.ascontiguousarray(motion.acceleration[:, :, STEER]),
+            twist, twist_dot,
+        )  # fmt: skip
+        return wrench
+
+    if layout.balanced:
         torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
-        if added_torque is not None:
-            torque = torque + added_torque
+        if around.torque is not None:
+            torque = torque + around.torque
         force = _contact_forces(
-            numbers.modules,
-            *geometry,
-            numbers.radius,
-            steer_angle,
-            motion.velocity,
-            motion.acceleration,
-            torque,
-            twist,
-            derivative(twist, motion.rate),
-        )
-        twist = twist - slip_twist(motion, numbers, steer_angle, twist, force)
-        twist_dot = derivative(twist, motion.rate)
-        measured.append(_wrench_of(*geometry, steer_angle, force))
-        predicted.append(
-            _inertial_wrench(
-                numbers.chassis,
-                numbers.modules,
-                numbers.steer_axis,
-                steer_angle,
-                np.ascontiguousarray(motion.velocity[:, :, STEER]),
-                np.ascontiguousarray(motion.acceleration[:, :, STEER]),
-                twist,
-                twist_dot,
-            )
+            numbers.modules, *geometry, radius, steer_angle, velocity, motion.acceleration, torque, spin, twist, twist_dot
         )
     else:
-        twist_dot = derivative(twist, motion.rate)
-    if imu:
+        force = _shared_forces(*geometry, steer_angle, inertial_wrench())
+    slip = slips(numbers, motion.rate, speed, force, grip)
+    slip_twist, slip_contradiction = rigid_motions(numbers, steer_angle, slip)
+    twist = twist - slip_twist
+    twist_dot = derivative(twist, motion.rate)
+    measured, predicted = [], []
+    if layout.balanced:
+        measured.append(_wrench_of(*geometry, steer_angle, force, spin))
+        predicted.append(inertial_wrench())
+    measured.append(contradiction.reshape(len(twist), -1))
+    predicted.append(slip_contradiction.reshape(len(twist), -1))
+    if layout.imu:
         x, y = numbers.imu_position
         omega, alpha = twist[:, 2], twist_dot[:, 2]
         measured.append(motion.imu)
-        predicted.append(
-            np.stack(
-                [
-                    numbers.gyro_scale * omega + numbers.gyro_bias,
-                    twist_dot[:, 0]
-                    - omega * twist[:, 1]
-                    - alpha * y
-                    - omega**2 * x
-                    + numbers.accelerometer_bias[0],
-                    twist_dot[:, 1]
-                    + omega * twist[:, 0]
-                    + alpha * x
-                    - omega**2 * y
-                    + numbers.accelerometer_bias[1],
-                ],
-                axis=1,
-            )
-        )
+        rate = numbers.gyro_scale * omega + numbers.gyro_bias
+        along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x + numbers.accelerometer_bias[0]
+        across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y + numbers.accelerometer_bias[1]
+        predicted.append(np.stack([rate, along, across], axis=1))
+    if layout.pose:
+        measured.append(motion.tracked_twist)
+        predicted.append(twist)
     return np.concatenate(measured, axis=1), np.concatenate(predicted, axis=1)

@@ -12,12 +12,16 @@ as cheap as a fit.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import linalg
 
 from .noise_model import NoiseModel
 from .regression_problem import FloatArray, IntArray, RegressionProblem, Shape
+
+Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,42 +68,153 @@ class Candidate:
     gain: float
 
 
+@dataclasses.dataclass(frozen=True)
+class _ScanGroup:
+    """Candidates of one number P of base parameters, one row per term and shape, shapes of a term on end.
+
+    Attributes:
+        keys: term and shape of each; term: the former alone (K,).
+        columns: places in the bank (K, P).
+        deviations, lower, upper: of the parameters (K, P).
+        log_prior: of the terms (K,).
+    """
+
+    keys: tuple[tuple[int, Frozen], ...]
+    term: IntArray
+    columns: IntArray
+    deviations: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    log_prior: FloatArray
+
+
+class _ColumnBank:
+    """Whitened columns side by side, and their Gram matrices over all rows and by block.
+
+    Attributes:
+        by_block: (blocks, K, K); total: (K, K).
+    """
+
+    def __init__(self, blocks: Sequence[slice], rows: int) -> None:
+        self._blocks = blocks
+        self._data: FloatArray = np.zeros((rows, 0))
+        self.by_block: FloatArray = np.zeros((len(blocks), 0, 0))
+        self.total: FloatArray = np.zeros((0, 0))
+
+    def add(self, columns: FloatArray) -> slice:
+        """Add columns (R, m); return their places."""
+        before = self._data.shape[1]
+        self._data = np.concatenate([self._data, columns], axis=1)
+        count = self._data.shape[1]
+        grown = np.empty((len(self._blocks), count, count))
+        grown[:, :before, :before] = self.by_block
+        for k, piece in enumerate(self._blocks):
+            grown[k, :, before:] = self._data[piece].T @ columns[piece]
+        grown[:, before:, :before] = grown[:, :before, before:].transpose(0, 2, 1)
+        self.by_block = grown
+        self.total = grown.sum(axis=0)
+        return slice(before, count)
+
+    def rescale(self, factors: FloatArray) -> None:
+        """Multiply the rows of every block by a factor (blocks,)."""
+        for piece, factor in zip(self._blocks, factors, strict=True):
+            self._data[piece] *= factor
+        self.by_block *= factors[:, None, None] ** 2
+        self.total = self.by_block.sum(axis=0)
+
+    def columns(self, places: IntArray) -> FloatArray:
+        """Return columns (R, m) by their places."""
+        found: FloatArray = self._data[:, places]
+        return found
+
+
+def _marginal_gains(
+    gram: FloatArray,
+    cross: FloatArray,
+    moment: FloatArray,
+    projected: FloatArray,
+    deviations: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+) -> FloatArray:
+    """Gain in log evidence (K, N) of K candidates of P parameters each, for N targets; -inf beyond the bounds.
+
+    Args:
+        gram: of each candidate's own columns (K, P, P).
+        cross: L^-1 X^T of all candidates' columns (k, K P), with L L^T the precision of the set.
+        moment: candidates' columns times targets (K P, N).
+        projected: L^-1 X^T of the targets (k, N).
+        deviations, lower, upper: of the parameters (K or 1, P).
+    """
+    count, width = gram.shape[0], gram.shape[1]
+    moment = (moment - cross.T @ projected).reshape(count, width, -1)
+    cross = cross.reshape(-1, count, width)
+    schur = gram - np.einsum("ksp,ksq->spq", cross, cross, optimize=True)
+    schur = schur + np.eye(width) / deviations[:, :, None] ** 2
+    mean = np.linalg.solve(schur, moment)
+    explained = np.einsum("spn,spn->sn", moment, mean)
+    log_determinant = np.linalg.slogdet(schur)[1] + 2.0 * np.sum(np.log(deviations), axis=1)
+    gain = 0.5 * explained - 0.5 * log_determinant[:, None]
+    allowed = np.all((mean >= lower[:, :, None]) & (mean <= upper[:, :, None]), axis=1)
+    result: FloatArray = np.where(allowed, gain, -np.inf)
+    return result
+
+
 class WhitenedRegression:
-    """One problem under one noise model and one set of robust weights."""
+    """One problem under one noise model and one set of robust weights.
+
+    Whitened columns stand in one bank with their block-wise Gram matrix, which grows as columns are asked for; fits and
+    scans only pick from it.
+    """
 
     def __init__(
-        self, problem: RegressionProblem, noise: NoiseModel, weights: FloatArray, block: IntArray
+        self, problem: RegressionProblem, noise: NoiseModel, weights: FloatArray, block: IntArray | None
     ) -> None:
         """Whiten residual and nuisances.
 
         Args:
             weights: robust weight per whitened sample (T, C).
-            block: block of each sample for cross-validation (T,), non-decreasing.
+            block: block of each sample for cross-validation (T,), non-decreasing; None: the channels are the blocks, and
+                `rescale` may weigh them anew (with white noise only, which ties no channel to another).
         """
         self.problem = problem
         self.noise = noise
         usable = noise.usable(problem.valid, problem.segment)
-        self._flat = np.flatnonzero(usable.ravel())
+        samples = np.arange(usable.size).reshape(usable.shape)
+        self._flat = samples[usable] if block is not None else samples.T[usable.T]
         self._root = np.sqrt(weights.ravel()[self._flat])
         self.target = self._rows(problem.residual)
         self.nuisance = self._rows(problem.nuisance_columns())
         self.rows = len(self._flat)
         # Robust weights lower the information; the evidence counts samples by weight.
         self.effective_rows = float(np.sum(self._root**2))
-        sample_block = block[self._flat // problem.residual.shape[1]]
+        channels = problem.residual.shape[1]
+        sample_block = self._flat % channels if block is None else block[self._flat // channels]
         self._sample_block = sample_block
         edges = np.flatnonzero(np.diff(sample_block)) + 1
         bounds = [0, *edges.tolist(), self.rows]
         self.blocks = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-        self._columns: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = {}
-        self._products: dict[tuple[object, object], FloatArray] = {}
-        self._scans: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._bank = _ColumnBank(self.blocks, self.rows)
+        self._base = self._bank.add(np.concatenate([self.nuisance, self.target[:, None]], axis=1))
+        self._places: dict[tuple[int, Frozen], slice] = {}
+        self._long_scans: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._short_scans: list[_ScanGroup] | None = None
 
     def _rows(self, values: FloatArray) -> FloatArray:
         """Whiten (T, C) or (T, C, K), keep usable rows, apply root weights -> (R,) or (R, K)."""
         white = self.noise.whiten(values, self.problem.valid, self.problem.segment)
         flat = white.reshape(-1, *values.shape[2:])[self._flat]
         return flat * self._root.reshape(-1, *(1,) * (flat.ndim - 1))
+
+    def rescale(self, deviations: FloatArray) -> None:
+        """Take the noise of each channel to have these deviations (C,)."""
+        before = 1.0 / self.noise.taps[self.block_labels(), 0]
+        self.noise = dataclasses.replace(self.noise, taps=1.0 / deviations[:, None])
+        factors = before / deviations[self.block_labels()]
+        for piece, factor in zip(self.blocks, factors, strict=True):
+            self.target[piece] *= factor
+            self.nuisance[piece] *= factor
+        self._bank.rescale(factors)
 
     def block_labels(self) -> list[int]:
         """Labels of the blocks that hold usable rows, in the order of `blocks`."""
@@ -120,12 +235,18 @@ class WhitenedRegression:
         """Whiten further columns (T, C, K) -> (R, K)."""
         return self._rows(columns)
 
+    def _place(self, term: int, shape: Frozen) -> slice:
+        """Where the columns of a term at one shape stand in the bank."""
+        if (term, shape) not in self._places:
+            self._places[term, shape] = self._bank.add(self._rows(self.problem.columns(term, shape)))
+        return self._places[term, shape]
+
+    def _indices(self, instance: Instance) -> IntArray:
+        return self._place(instance.term, instance.shape).start + np.array(instance.active, dtype=np.int64)
+
     def columns(self, instance: Instance) -> FloatArray:
         """Whitened exact columns of an instance's active parameters (R, active)."""
-        key = (instance.term, instance.shape)
-        if key not in self._columns:
-            self._columns[key] = self._rows(self.problem.columns(*key))
-        return self._columns[key][:, list(instance.active)]
+        return self._bank.columns(self._indices(instance))
 
     def deviations(self, instances: Sequence[Instance]) -> FloatArray:
         """Prior deviations of nuisances and active parameters (k,)."""
@@ -135,35 +256,21 @@ class WhitenedRegression:
             parts.append(np.array([parameters[i].deviation for i in instance.active]))
         return np.concatenate(parts)
 
-    def _product(self, a: object, left: FloatArray, b: object, right: FloatArray) -> FloatArray:
-        """Block-wise left^T right, (blocks, ka, kb), remembered."""
-        if (a, b) in self._products:
-            return self._products[a, b]
-        if (b, a) in self._products:
-            return self._products[b, a].transpose(0, 2, 1)
-        product = np.stack([left[piece].T @ right[piece] for piece in self.blocks])
-        self._products[a, b] = product
-        return product
+    def _picked(self, instances: Sequence[Instance]) -> IntArray:
+        """Places in the bank of [nuisances, instances..., target]."""
+        nuisances = np.arange(self._base.start, self._base.stop - 1)
+        return np.concatenate([nuisances, *[self._indices(i) for i in instances], [self._base.stop - 1]])
 
     def grams(self, instances: Sequence[Instance]) -> FloatArray:
         """Block-wise Gram matrices of [nuisances, instances..., target], (blocks, k + 1, k + 1)."""
-        keys: list[object] = ["nuisance", *[(i.term, i.shape, i.active) for i in instances], "target"]
-        parts = [self.nuisance, *[self.columns(i) for i in instances], self.target[:, None]]
-        sizes = [part.shape[1] for part in parts]
-        starts = np.concatenate([[0], np.cumsum(sizes)])
-        gram = np.empty((len(self.blocks), starts[-1], starts[-1]))
-        for i, left in enumerate(parts):
-            for j in range(i, len(parts)):
-                product = self._product(keys[i], left, keys[j], parts[j])
-                gram[:, starts[i] : starts[i + 1], starts[j] : starts[j + 1]] = product
-                gram[:, starts[j] : starts[j + 1], starts[i] : starts[i + 1]] = product.transpose(0, 2, 1)
-        return gram
+        picked = self._picked(instances)
+        return self._bank.by_block[:, picked[:, None], picked]
 
     def fit(self, instances: Sequence[Instance]) -> Fit:
         """Joint fit of nuisances and instances."""
-        gram = self.grams(instances).sum(axis=0)
+        picked = self._picked(instances)
         deviations = self.deviations(instances)
-        mean, inverse, log_determinant, rss = _solve(gram, deviations)
+        mean, inverse, log_determinant, rss = _solve(self._bank.total[picked[:, None], picked], deviations)
         occam = sum(instance.occam for instance in instances)
         prior = sum(self.problem.terms[instance.term].log_prior for instance in instances)
         log_evidence = -0.5 * log_determinant - 0.5 * rss - occam + prior
@@ -181,13 +288,12 @@ class WhitenedRegression:
     def block_scores(self, instances: Sequence[Instance]) -> FloatArray:
         """Squared whitened error of every block, predicted from the fit to all other blocks, (blocks,)."""
         grams = self.grams(instances)
-        total = grams.sum(axis=0)
         deviations = self.deviations(instances)
-        scores = np.empty(len(grams))
-        for index, gram in enumerate(grams):
-            mean, *_ = _solve(total - gram, deviations)
-            extended = np.append(-mean, 1.0)
-            scores[index] = extended @ gram @ extended
+        precision = np.diag(1.0 / deviations**2)
+        others = grams.sum(axis=0) - grams
+        mean = np.linalg.solve(others[:, :-1, :-1] + precision, others[:, :-1, -1:])[:, :, 0]
+        extended = np.concatenate([-mean, np.ones((len(grams), 1))], axis=1)
+        scores: FloatArray = np.einsum("bi,bij,bj->b", extended, grams, extended)
         return scores
 
     def tolerance_cost(self, fit: Fit) -> float:
@@ -195,22 +301,59 @@ class WhitenedRegression:
         count = len(self.problem.nuisances)
         return 0.5 * float(np.sum((fit.mean[:count] / self.problem.nuisance_deviations()) ** 2))
 
-    def _scan_arrays(self, term_index: int) -> tuple[FloatArray, FloatArray]:
-        """Whitened scan columns (R, shapes, P) of base parameters, and their Gram matrices (shapes, P, P)."""
-        if term_index not in self._scans:
+    # -- scan ---------------------------------------------------------------------------------------------------
+
+    def _long_scan(self, term_index: int) -> tuple[FloatArray, FloatArray]:
+        """Whitened scan columns (R, shapes, P) of a term with a long grid, and their Gram matrices (shapes, P, P)."""
+        if term_index not in self._long_scans:
             term = self.problem.terms[term_index]
-            if term.scan is not None:
-                full = term.scan()
-            else:
-                shapes_tried = [tuple(sorted(shape.items())) for shape in term.shapes]
-                full = np.stack([self.problem.columns(term_index, shape) for shape in shapes_tried], axis=2)
-            base = full[..., list(term.base_indices())]
+            base = term.scan()[..., list(term.base_indices())]  # type: ignore[misc]
             samples, channels, shapes, width = base.shape
             white = self._rows(base.reshape(samples, channels, shapes * width))
-            white = white.astype(np.float32 if shapes * width > 200 else float).reshape(-1, shapes, width)
+            white = white.astype(np.float32).reshape(-1, shapes, width)
             gram = np.einsum("rsp,rsq->spq", white, white, optimize=True).astype(float)
-            self._scans[term_index] = (white, gram)
-        return self._scans[term_index]
+            self._long_scans[term_index] = (white, gram)
+        return self._long_scans[term_index]
+
+    def _short_scan(self) -> list[_ScanGroup]:
+        """All terms without a long grid, grouped by their number of base parameters."""
+        if self._short_scans is None:
+            problem = self.problem
+            wanted = [
+                (index, tuple(sorted(shape.items())))
+                for index, term in enumerate(problem.terms)
+                if term.scan is None
+                for shape in term.shapes
+            ]
+            missing = [key for key in wanted if key not in self._places]
+            if missing:
+                raw = [problem.columns(*key) for key in missing]
+                place = self._bank.add(self._rows(np.concatenate(raw, axis=2))).start
+                for key, columns in zip(missing, raw, strict=True):
+                    self._places[key] = slice(place, place + columns.shape[2])
+                    place += columns.shape[2]
+            groups: dict[int, list[tuple[int, Frozen]]] = {}
+            for key in wanted:
+                groups.setdefault(len(problem.terms[key[0]].base_indices()), []).append(key)
+            self._short_scans = [
+                _ScanGroup(
+                    keys=tuple(keys),
+                    term=np.array([index for index, _ in keys]),
+                    columns=np.array([
+                        [self._places[key].start + i for i in problem.terms[key[0]].base_indices()] for key in keys
+                    ]),
+                    deviations=self._per_key(keys, "deviation"),
+                    lower=self._per_key(keys, "lower"),
+                    upper=self._per_key(keys, "upper"),
+                    log_prior=np.array([problem.terms[index].log_prior for index, _ in keys]),
+                )
+                for keys in groups.values()
+            ]
+        return self._short_scans
+
+    def _per_key(self, keys: Sequence[tuple[int, Frozen]], name: str) -> FloatArray:
+        terms = self.problem.terms
+        return np.array([[getattr(terms[t].parameters[i], name) for i in terms[t].base_indices()] for t, _ in keys])
 
     def scan(
         self,
@@ -226,49 +369,76 @@ class WhitenedRegression:
             only: indices of the terms to look at; None for all.
 
         Returns:
-            N lists of candidates; gain is marginal over the grid of shapes, -inf where a sign is not allowed.
+            N lists of candidates, for the problem's own target sorted by gain; gain is marginal over the grid of shapes,
+            -inf where a sign is not allowed.
         """
-        own = targets is None
-        right = self.target[:, None] if targets is None else targets
-        design = self.design(instances)
-        deviations = self.deviations(instances)
-        precision = design.T @ design + np.diag(1.0 / deviations**2)
+        short = self._short_scan()
+        picked = self._picked(instances)[:-1]
+        bank, deviations = self._bank, self.deviations(instances)
+        precision = bank.total[picked[:, None], picked] + np.diag(1.0 / deviations**2)
         factor = np.linalg.cholesky(precision)
-        projected = np.linalg.solve(factor, design.T @ right)
-        results: list[list[Candidate]] = [[] for _ in range(right.shape[1])]
+        last = self._base.stop - 1
+        own = bank.total[picked, last][:, None] if targets is None else bank.columns(picked).T @ targets
+        projected = linalg.solve_triangular(factor, own, lower=True)
         used = {instance.term for instance in instances}
-        for index, term in enumerate(self.problem.terms):
-            if (only is not None and index not in only) or (index in used and not term.repeatable):
+
+        def wanted(index: int) -> bool:
+            return (only is None or index in only) and (index not in used or self.problem.terms[index].repeatable)
+
+        results: list[list[Candidate]] = [[] for _ in range(own.shape[1])]
+        for group in short:
+            keep = np.array([wanted(index) for index in group.term], dtype=bool)
+            if not keep.any():
                 continue
-            white, gram = self._scan_arrays(index)
-            _, shapes, width = white.shape
-            flat = white.reshape(len(white), shapes * width)
-            cross = np.linalg.solve(factor, (flat.T @ design.astype(flat.dtype)).astype(float).T)
-            moment = (flat.T @ right.astype(flat.dtype)).astype(float) - cross.T @ projected
-            prior = np.array([term.parameters[i].deviation for i in term.base_indices()])
-            cross = cross.reshape(-1, shapes, width)
-            schur = gram + np.diag(1.0 / prior**2) - np.einsum("ksp,ksq->spq", cross, cross)
-            moment = moment.reshape(shapes, width, -1)
-            mean = np.linalg.solve(schur, moment)
-            explained = np.einsum("spn,spn->sn", moment, mean)
-            log_determinant = np.linalg.slogdet(schur)[1] + 2.0 * np.sum(np.log(prior))
-            gain = 0.5 * explained - 0.5 * log_determinant[:, None] + term.log_prior
-            lower = np.array([term.parameters[i].lower for i in term.base_indices()])
-            upper = np.array([term.parameters[i].upper for i in term.base_indices()])
-            allowed = np.all((mean >= lower[:, None]) & (mean <= upper[:, None]), axis=1)
-            gain = np.where(allowed, gain, -np.inf)
-            best = np.argmax(gain, axis=0)
-            top = gain[best, np.arange(gain.shape[1])]
-            with np.errstate(invalid="ignore"):
-                marginal = top + np.log(np.mean(np.exp(gain - top), axis=0))
-            for n in range(gain.shape[1]):
-                value = float(marginal[n]) if np.isfinite(top[n]) else -np.inf
-                occam = float(top[n] - marginal[n]) if np.isfinite(top[n]) else 0.0
-                shape = tuple(sorted(term.shapes[int(best[n])].items()))
-                results[n].append(Candidate(Instance(index, shape, term.base_indices(), occam), value))
-        if own:
+            columns = group.columns[keep]
+            flat = columns.ravel()
+            cross = linalg.solve_triangular(factor, bank.total[picked[:, None], flat], lower=True)
+            moment = bank.total[flat, last][:, None] if targets is None else bank.columns(flat).T @ targets
+            gains = _marginal_gains(
+                bank.total[columns[:, :, None], columns[:, None, :]], cross, moment, projected,
+                group.deviations[keep], group.lower[keep], group.upper[keep],
+            ) + group.log_prior[keep][:, None]  # fmt: skip
+            keys = [key for key, kept in zip(group.keys, keep, strict=True) if kept]
+            self._collect(keys, gains, results)
+        for index, term in enumerate(self.problem.terms):
+            if term.scan is None or not wanted(index):
+                continue
+            white, gram = self._long_scan(index)
+            flat_columns = white.reshape(len(white), -1)
+            design = bank.columns(picked)
+            cross = linalg.solve_triangular(
+                factor, (flat_columns.T @ design.astype(np.float32)).astype(float).T, lower=True
+            )
+            right = self.target[:, None] if targets is None else targets
+            moment = (flat_columns.T @ right.astype(np.float32)).astype(float)
+            parameters = [term.parameters[i] for i in term.base_indices()]
+            bounds = [np.array([[getattr(p, name) for p in parameters]]) for name in ("deviation", "lower", "upper")]
+            gains = _marginal_gains(gram, cross, moment, projected, *bounds) + term.log_prior
+            self._collect([(index, tuple(sorted(shape.items()))) for shape in term.shapes], gains, results)
+        if targets is None:
             results[0].sort(key=lambda candidate: -candidate.gain)
         return results
+
+    def _collect(
+        self, keys: Sequence[tuple[int, Frozen]], gains: FloatArray, results: list[list[Candidate]]
+    ) -> None:
+        """Add the best shape of every term to the results, with its gain marginal over the shapes; gains (keys, N)."""
+        terms = np.array([index for index, _ in keys])
+        starts = np.flatnonzero(np.r_[True, np.diff(terms) != 0])
+        for start, stop in zip(starts, [*starts[1:], len(terms)], strict=True):
+            gain = gains[start:stop]
+            best = np.argmax(gain, axis=0)
+            top = gain[best, np.arange(gain.shape[1])]
+            index = int(terms[start])
+            base = self.problem.terms[index].base_indices()
+            # A grid that was narrowed down beforehand is paid for as the whole that it was chosen from.
+            paid = math.log(max(self.problem.terms[index].grid_size, stop - start))
+            with np.errstate(invalid="ignore", over="ignore"):
+                marginal = top + np.log(np.sum(np.exp(gain - top), axis=0)) - paid
+            for n in range(gain.shape[1]):
+                finite = bool(np.isfinite(top[n]))
+                value, occam = (float(marginal[n]), float(top[n] - marginal[n])) if finite else (-np.inf, 0.0)
+                results[n].append(Candidate(Instance(index, keys[start + int(best[n])][1], base, occam), value))
 
     def within_bounds(self, fit: Fit) -> bool:
         """Whether every parameter of a fit lies within its bounds."""

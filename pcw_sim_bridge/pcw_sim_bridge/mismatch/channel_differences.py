@@ -1,0 +1,82 @@
+"""What a change of the model changes in a robot's channels: the one place that columns of nuisances and effects come from."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pcw_description.effect_instance import EffectInstance
+
+from .regression_problem import FloatArray
+from .robot_effects import ChannelModel, normal_along
+from .robot_motion import RobotMotion
+from .rolling_model import ModelNumbers
+from .signal_filter import SignalFilter
+
+
+class ChannelDifferences:
+    """The channels of some motions under a model, and under models that differ from it.
+
+    Attributes:
+        model: the channel model.
+        motions: true motions, each with a pose.
+        filters: of the channels, one per motion.
+        measured, predicted, residual: filtered, (T, C).
+    """
+
+    def __init__(self, model: ChannelModel, motions: Sequence[RobotMotion], filters: Sequence[SignalFilter]) -> None:
+        self.model, self.motions, self.filters = model, motions, filters
+        self._around = [model.around(motion) for motion in motions]
+        self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
+        self.known = [np.isfinite(measured) for measured, _ in self._sides]
+        self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])
+        self.predicted = self.filtered([predicted for _, predicted in self._sides])
+        self.residual = self.measured - self.predicted
+        self.normal = [normal_along(motion, model.numbers) for motion in motions]
+
+    def filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
+        """Filter one array (T, ...) per motion and put them on end."""
+        return np.concatenate([f.apply(piece) for f, piece in zip(self.filters, pieces, strict=True)])
+
+    def of_numbers(self, vary: Callable[[ModelNumbers, float], None], step: float) -> FloatArray:
+        """Column (T, C): what the residual holds per unit by which a number of the model is off."""
+        numbers = copy.deepcopy(self.model.numbers)
+        vary(numbers, step)
+        pieces = []
+        for motion, around, plain in zip(self.motions, self._around, self._sides, strict=True):
+            measured, predicted = self.model.sides(motion, around, numbers)
+            pieces.append(np.nan_to_num(((plain[0] - plain[1]) - (measured - predicted)) / step))
+        return self.filtered(pieces)
+
+    def of_lean(self, change: FloatArray) -> FloatArray:
+        """What a lean of gravity by `change` (3,) adds to the residual, (T, C)."""
+        pieces = []
+        for motion, plain in zip(self.motions, self._sides, strict=True):
+            measured, predicted = plain[0].copy(), plain[1].copy()
+            self.model.lean(motion, change, measured, predicted)
+            pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
+        return self.filtered(pieces)
+
+    def of_effect(self, instance: EffectInstance) -> FloatArray:
+        """What an effect adds to the residual, (T, C)."""
+        pieces = []
+        for motion, around, plain in zip(self.motions, self._around, self._sides, strict=True):
+            measured, predicted = self.model.sides_with(motion, around, plain, instance)
+            pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
+        return self.filtered(pieces)
+
+    def of_torque(self, torques: Sequence[FloatArray]) -> FloatArray:
+        """What torques (T, n, 2) [N m] on the joints, one array per motion, add to the residual, (T, C)."""
+        size = max(max(float(np.max(np.abs(torque))) for torque in torques), 1e-12)
+        # Small against the weight, so that the tyres' curves stay straight.
+        robot = self.model.robot
+        scale = 1e-2 * robot.total_mass * float(np.mean(self.model.numbers.radius)) / size
+        pieces = []
+        for motion, around, plain, torque in zip(self.motions, self._around, self._sides, torques, strict=True):
+            more = scale * torque if around.torque is None else around.torque + scale * torque
+            measured, predicted = self.model.sides(motion, dataclasses.replace(around, torque=more))
+            pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)) / scale)
+        return self.filtered(pieces)

@@ -1,0 +1,157 @@
+"""The numbers of a robot's description that a healthy robot may differ in, as columns of its channels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from pcw_description.contact.contact_model import LENGTH
+from pcw_description.robot_description import AXIS_NAMES, RobotDescription
+
+from .channel_differences import ChannelDifferences
+from .regression_problem import Nuisance
+from .rolling_model import ModelNumbers
+
+Vary = Callable[[ModelNumbers, float], None]
+# (tolerance, label, nominal value, variation)
+Deviation = tuple[str, str, float, Vary]
+Index = int | tuple[int, ...]
+
+
+def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) -> list[Nuisance]:
+    """Return every number that has a tolerance and shows in the channels, and the lean of the floor."""
+    found = []
+    layout = differences.model.layout
+    if layout.balanced:
+        # A drive reports the torque of some instant within its own cycle; nobody knows which.
+        sampling = max(motion.sampling for motion in differences.motions)
+        found.append(_nuisance(differences, "torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
+    deviations = list(_geometry(robot))
+    if layout.balanced:
+        deviations += _dynamics(robot, differences.model.numbers)
+    deviations += _tyres(robot)
+    if layout.imu:
+        deviations += _inertial_sensor()
+    for tolerance, label, nominal, vary in deviations:
+        known = robot.tolerance(tolerance)
+        deviation = known.value * abs(nominal) if known.relative else known.value
+        if deviation > 0.0:
+            found.append(_nuisance(differences, label, known.unit, nominal, deviation, vary))
+    return found + _floor(robot, differences)
+
+
+def _nuisance(
+    differences: ChannelDifferences, label: str, unit: str, nominal: float, deviation: float, vary: Vary
+) -> Nuisance:
+    return Nuisance(label, unit, nominal, deviation, differences.of_numbers(vary, 0.5 * deviation))
+
+
+def _entry(name: str, index: Index | None = None) -> Vary:
+    """Vary one number, one entry of an array, or with no index all of it."""
+
+    def vary(numbers: ModelNumbers, step: float) -> None:
+        if index is None:
+            setattr(numbers, name, getattr(numbers, name) + step)
+        else:
+            getattr(numbers, name)[index] += step
+
+    return vary
+
+
+def _scaled(column: int, nominal: float) -> Vary:
+    """Vary a column of the modules' numbers in proportion."""
+
+    def vary(numbers: ModelNumbers, step: float) -> None:
+        numbers.modules[:, column] *= 1.0 + step / nominal
+
+    return vary
+
+
+def _radius(index: int) -> Vary:
+    """Vary a wheel's radius in the kinematics and in the dynamics, which holds its own copy."""
+
+    def vary(numbers: ModelNumbers, step: float) -> None:
+        numbers.radius[index] += step
+        numbers.modules[index, 8] += step
+
+    return vary
+
+
+def _gain(index: int, axis: int) -> Vary:
+    """Vary a torque constant against the mean of all.
+
+    What they share cannot be told from the masses. Left free it would be fitted below its value, since whoever scales
+    down all measured forces scales down their noise with them.
+    """
+
+    def vary(numbers: ModelNumbers, step: float) -> None:
+        numbers.gain[index, axis] += step
+        numbers.gain -= step / numbers.gain.size
+
+    return vary
+
+
+def _geometry(robot: RobotDescription) -> Iterator[Deviation]:
+    for i, caster in enumerate(robot.casters):
+        yield "wheel_radius", f"wheel_radius/{caster.name}", caster.wheel_radius, _radius(i)
+        yield "steer_zero", f"steer_zero/{caster.name}", 0.0, _entry("steer_zero", i)
+        for k, axis in enumerate("xy"):
+            yield "caster_offset", f"caster_offset.{axis}/{caster.name}", 0.0, _entry("caster_offset", (i, k))
+            yield "steer_axis", f"steer_axis.{axis}/{caster.name}", 0.0, _entry("steer_axis", (i, k))
+
+
+def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviation]:
+    first = robot.casters[0]
+    yield "chassis.mass", "chassis.mass", robot.chassis.mass, _entry("chassis", 0)
+    yield "chassis.com", "chassis.com.x", 0.0, _entry("chassis", 1)
+    yield "chassis.com", "chassis.com.y", 0.0, _entry("chassis", 2)
+    yield "chassis.inertia_zz", "chassis.inertia_zz", robot.chassis.inertia_zz, _entry("chassis", 3)
+    for label, column, nominal in (
+        ("module.mass", 0, first.module.mass),
+        ("module.inertia_zz", 3, first.module.inertia_zz),
+        ("wheel.inertia_axle", 4, first.wheel.inertia_axle),
+    ):
+        yield label, label, nominal, _scaled(column, nominal)
+    for rotor, column in (("drive", 5), ("steer", 7)):
+        inertia = float(numbers.modules[0, column])
+        if inertia > 0.0:
+            yield "rotors", f"rotors.{rotor}", inertia, _scaled(column, inertia)
+    for i, caster in enumerate(robot.casters):
+        for axis, axis_name in enumerate(AXIS_NAMES):
+            yield "torque_constant", f"torque_constant/{caster.name}_{axis_name}", 1.0, _gain(i, axis)
+
+
+def _tyres(robot: RobotDescription) -> Iterator[Deviation]:
+    yield "contact.stiffness", "contact.stiffness", 1.0, _entry("softness")
+    length = robot.contact.relaxation_length
+
+    def relaxation(numbers: ModelNumbers, step: float) -> None:
+        numbers.tyres[:, LENGTH] *= 1.0 + step / length
+
+    yield "contact.relaxation_length", "contact.relaxation_length", length, relaxation
+    for i, caster in enumerate(robot.caster_names):
+        for axis, axis_name in enumerate(AXIS_NAMES):
+            yield "contact.stiffness_spread", f"contact.stiffness/{caster}_{axis_name}", 1.0, _entry("softness", (i, axis))
+
+
+def _inertial_sensor() -> Iterator[Deviation]:
+    yield "imu.scale", "imu.gyro_scale", 1.0, _entry("gyro_scale")
+    yield "imu.gyro_bias", "imu.gyro_bias", 0.0, _entry("gyro_bias")
+    for k, axis in enumerate("xy"):
+        yield "imu.accelerometer_bias", f"imu.accelerometer_bias.{axis}", 0.0, _entry("accelerometer_bias", k)
+        yield "imu.position", f"imu.position.{axis}", 0.0, _entry("imu_position", k)
+
+
+def _floor(robot: RobotDescription, differences: ChannelDifferences) -> list[Nuisance]:
+    """No floor is quite level: its inclination along both axes of the yaw."""
+    layout, tolerance = differences.model.layout, robot.tolerance("ground.slope")
+    if not (layout.balanced or layout.imu) or tolerance.value == 0.0:
+        return []
+    found = []
+    for k, axis in enumerate("xy"):
+        change = np.zeros(3)
+        change[k] = tolerance.value
+        column = differences.of_lean(change) / tolerance.value
+        found.append(Nuisance(f"ground.slope.{axis}", tolerance.unit, 0.0, tolerance.value, column))
+    return found

@@ -1,0 +1,237 @@
+"""Every effect that a robot's channels can show, as a candidate with its columns.
+
+An effect on joints is a candidate at each caster and at all of them together, on each axis that it can stand at. Its
+columns are differences of the channels with it at work, by the effect's own function. Parameters that shape an effect
+are searched on a grid where there is one to search on; everything else is left at its default.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.effect import Effect, EffectParameter
+from pcw_description.effects.kinds import (
+    ActuatorEffect,
+    ChassisForceEffect,
+    ContactEffect,
+    DescriptionEffect,
+    JointTorqueEffect,
+    TransmissionEffect,
+)
+from pcw_description.effects.registry import all_effects
+from pcw_description.robot_description import AXIS_NAMES, RobotDescription
+
+from .axis_channels import kernel_arguments
+from .channel_differences import ChannelDifferences
+from .regression_problem import FloatArray, LinearParameter, Shape, Term
+
+DIRECTIONS = 8  # of a grid over all directions
+# What a leftover may depend on that an effect of a kind explains.
+VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
+    DescriptionEffect: ("acceleration",), ChassisForceEffect: ("speed", "v_x", "v_y"),
+}  # fmt: skip
+_ARGUMENT_NAMES = {"position": "angle", "velocity": "velocity", "force": "torque", "normal_force": "normal_force"}
+
+
+def robot_terms(robot: RobotDescription, differences: ChannelDifferences) -> list[Term]:
+    """Return all candidates whose effects show in the channels."""
+    return _TermMaker(robot, differences).terms()
+
+
+class _TermMaker:
+    """Makes the candidates of one problem."""
+
+    def __init__(self, robot: RobotDescription, differences: ChannelDifferences) -> None:
+        self.robot, self.differences = robot, differences
+        self.layout = differences.model.layout
+
+    def terms(self) -> list[Term]:
+        """All candidates."""
+        found = []
+        everything: list[tuple[str, ...]] = [*((name,) for name in self.robot.caster_names), self.robot.caster_names]
+        for effect in all_effects().values():
+            if isinstance(effect, ActuatorEffect):
+                continue
+            for axis in effect.axes or (None,):
+                for target in everything if effect.target_kind == "caster" else [(effect.target_kind,)]:
+                    term = (
+                        self._joint_term(effect, target, axis)
+                        if isinstance(effect, JointTorqueEffect)
+                        else self._difference_term(effect, target, axis)
+                    )
+                    if term is not None:
+                        found.append(term)
+        return found
+
+    # -- torques on joints --------------------------------------------------------------------------------------
+
+    def _joint_term(self, effect: JointTorqueEffect, target: tuple[str, ...], axis: str | None) -> Term | None:
+        shapes = self._speed_shapes(effect)
+        if not self.layout.balanced or shapes is None:
+            return None
+
+        def columns(shape: Shape) -> FloatArray:
+            return self._joint_columns(effect, target, axis, shape)
+
+        first = columns(shapes[0])
+        size = np.sqrt(np.mean(self.differences.measured[:, :3] ** 2))
+        parameters = []
+        for k, parameter in enumerate(effect.linear_parameters):
+            scale = float(np.sqrt(np.mean(first[:, :3, k] ** 2)))
+            deviation = float(size) / max(scale, 1e-12)
+            parameters.append(
+                LinearParameter(
+                    parameter.name, parameter.unit, parameter.lower, parameter.upper, deviation,
+                    refinement=parameter.name == "asymmetry",
+                )
+            )
+        arguments = [_ARGUMENT_NAMES[argument] for argument in kernel_arguments(effect.name)]
+        return Term(
+            effect=effect.name,
+            axis=axis,
+            log_prior=effect.log_prior,
+            target=target,
+            parameters=tuple(parameters),
+            shapes=shapes,
+            columns=columns,
+            arguments=tuple(f"{axis or effect.axis}_{argument}/{name}" for argument in arguments for name in target),
+            resolution={p.name: ("log", 2.15) for p in effect.nonlinear_parameters if p.default is None},
+        )
+
+    def _joint_columns(
+        self, effect: JointTorqueEffect, target: Sequence[str], axis: str | None, shape: Shape
+    ) -> FloatArray:
+        """Columns (T, C, P) of an effect at work on some casters with common parameters."""
+        column = AXIS_NAMES.index(axis or effect.axis)
+        casters = [self.robot.caster_index(name) for name in target]
+        torques: dict[str, list[FloatArray]] = {parameter.name: [] for parameter in effect.linear_parameters}
+        for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
+            for found in torques.values():
+                found.append(np.zeros(motion.position.shape))
+            for i in casters:
+                signals = (motion.position, motion.velocity, motion.torque)
+                by_name = effect.regressor(*(signal[:, i, column] for signal in signals), normal[:, i], shape)
+                for name, values in by_name.items():
+                    torques[name][-1][:, i, column] = values
+        return np.stack([self.differences.of_torque(pieces) for pieces in torques.values()], axis=2)
+
+    def _speed_shapes(self, effect: JointTorqueEffect) -> tuple[dict[str, float], ...] | None:
+        """Grid of an effect's shaping parameters, or None for effects whose search does not pay on a rolling robot."""
+        shapes: list[dict[str, float]] = [{}]
+        axis = AXIS_NAMES.index(effect.axis)
+        speeds = np.concatenate([np.abs(motion.velocity[:, :, axis]).ravel() for motion in self.differences.motions])
+        top = float(np.quantile(speeds, 0.98))
+        for parameter in effect.nonlinear_parameters:
+            if parameter.default is not None:
+                values = [parameter.default]
+            elif parameter.unit == "rad/s":
+                values = [float(value) for value in np.geomspace(0.05, 0.5, 4) * top]
+            else:
+                return None
+            shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
+        return tuple(shapes)
+
+    # -- everything else ----------------------------------------------------------------------------------------
+
+    def _difference_term(self, effect: Effect, target: tuple[str, ...], axis: str | None) -> Term | None:
+        """A candidate by differences of the whole channel model; None if no channel shows it."""
+        searched = effect.searched_parameters
+        if not searched or (isinstance(effect, ContactEffect) and not self.layout.balanced):
+            return None
+        if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):
+            return None
+        grid = self._grid(effect)
+        if grid is None:
+            return None
+        shapes, resolution = grid
+        neutral = {p.name: self._neutral(p) for p in searched}
+
+        def columns(shape: Shape, names: Sequence[str]) -> FloatArray:
+            found = []
+            for name in names:
+                parameter = effect.parameter(name)
+                step, value = _step(parameter, neutral[name])
+                instance = EffectInstance(effect.name, target, {**shape, **neutral, name: value}, axis)
+                found.append(self.differences.of_effect(instance) / step)
+            return np.stack(found, axis=2)
+
+        everything = columns(shapes[0], [p.name for p in searched])
+        shown = [p for k, p in enumerate(searched) if np.abs(everything[:, :, k]).max() > 0.0]
+        if not shown:
+            return None
+        names = [p.name for p in shown]
+        return Term(
+            effect=effect.name,
+            axis=axis,
+            log_prior=effect.log_prior,
+            target=target,
+            shapes=shapes,
+            columns=lambda shape: columns(shape, names),
+            arguments=VARIABLES_OF.get(type(effect), ()),
+            parameters=tuple(_linear(p, neutral[p.name]) for p in shown),
+            resolution=resolution,
+        )
+
+    def _has_rotors(self, target: Sequence[str], axis: str) -> bool:
+        """Whether there are motors that a gear could let turn on their own."""
+        casters = [self.robot.casters[self.robot.caster_index(name)] for name in target]
+        return self.layout.balanced and all(getattr(caster.rotors, axis) > 0.0 for caster in casters)
+
+    def _neutral(self, parameter: EffectParameter) -> float:
+        """Value at which the parameter changes nothing."""
+        if parameter.reciprocal:
+            return parameter.upper
+        if parameter.neutral:
+            value: object = self.robot
+            for attribute in parameter.neutral.split("."):
+                value = getattr(value, attribute)
+            return float(value)  # type: ignore[arg-type]
+        return 0.0
+
+    def _grid(self, effect: Effect) -> tuple[tuple[dict[str, float], ...], Mapping[str, tuple[str, float]]] | None:
+        """Grid of the shaping parameters of an effect and its spacing; None where one can neither be searched nor left."""
+        reach = np.max(np.abs(self.robot.steer_axis), axis=0)
+        searched = {p.name for p in effect.searched_parameters}
+        shapes: list[dict[str, float]] = [{}]
+        resolution: dict[str, tuple[str, float]] = {}
+        for parameter in effect.parameters:
+            if parameter.name in searched:
+                continue
+            if parameter.name in ("x", "y"):
+                span = float(reach["xy".index(parameter.name)])
+                values = [-0.7 * span, 0.0, 0.7 * span]
+                resolution[parameter.name] = ("linear", 0.35 * span)
+            elif parameter.unit == "rad" and parameter.upper - parameter.lower > math.tau:
+                values = [k * math.tau / DIRECTIONS for k in range(DIRECTIONS)]
+                resolution[parameter.name] = ("linear", 0.5 * math.tau / DIRECTIONS)
+            elif parameter.default is not None:
+                values = [parameter.default]
+            else:
+                return None
+            shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
+        return tuple(shapes), resolution
+
+
+def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:
+    """Step of the linear coefficient that a difference is taken over, and the parameter's value there."""
+    if parameter.reciprocal:
+        step = 0.1 / parameter.typical
+        return step, 1.0 / step
+    step = 0.1 * parameter.typical
+    return step, neutral + step
+
+
+def _linear(parameter: EffectParameter, neutral: float) -> LinearParameter:
+    """The parameter as a regression coefficient: its inverse, or its distance from where it changes nothing."""
+    if parameter.reciprocal:
+        return LinearParameter(
+            parameter.name, parameter.unit, 0.0, 1.0 / parameter.lower, 3.0 / parameter.typical, reciprocal=True
+        )
+    return LinearParameter(
+        parameter.name, parameter.unit, parameter.lower - neutral, parameter.upper - neutral, 3.0 * parameter.typical,
+        origin=neutral,
+    )
