@@ -28,6 +28,7 @@ class EffectParameter:
         default: used when the description leaves the parameter out; None if it must be given.
         linear: the contribution is proportional to this parameter (all linear parameters together are additive).
         near_linear: it is so near zero, where the effect vanishes with it; its derivative there tells how the effect shows.
+        clause: what the effect's sentence goes on with where the number is not its default; `{name}` stands for it.
     """
 
     name: str
@@ -39,6 +40,7 @@ class EffectParameter:
     default: float | None = None
     linear: bool = False
     near_linear: bool = False
+    clause: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,4 +123,5 @@ class Effect:
         """Return one plain sentence that states the effect with its numbers, at `axis` (default: the effect's own)."""
         filled: dict[str, Any] = {parameter.name: parameter.default for parameter in self.parameters} | dict(parameters)
         joint = {"drive": "drive", "steer": "steering"}.get(axis or self.axis, "")
-        return self.sentence.format(target=" and ".join(target), joint=joint, **filled)
+        clauses = "".join(p.clause for p in self.parameters if filled[p.name] != p.default)
+        return (self.sentence.removesuffix(".") + clauses + ".").format(target=" and ".join(target), joint=joint, **filled)

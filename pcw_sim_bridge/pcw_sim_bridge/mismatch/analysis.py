@@ -331,6 +331,7 @@ def _notes(
     problem = explanation.search.problem
     for label, variable in explanation.withdrawn:
         notes.append(f"{label} was withdrawn: what is left depends on {variable}, which that effect does not.")
+    notes.extend(explanation.remarks)
     names = {channel.name for channel in problem.channels}
     if "axis_force" not in names:
         if not any(name.startswith("chassis") for name in names):
