@@ -69,7 +69,7 @@ class AxisSubject:
             sentence = sentence.replace(f" {unit}", f" \0{index}")
         for index, unit in enumerate(_LINEAR_WORDS):
             sentence = sentence.replace(f"\0{index}", self.axis.unit(unit))
-        return sentence
+        return sentence.replace("per radian", "per metre") if self.axis.kind == "linear" else sentence
 
     def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> AxisSubject:
         """Return the axis with effects added and its inertia as the recordings have it."""

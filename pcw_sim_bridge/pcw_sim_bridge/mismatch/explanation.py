@@ -142,7 +142,7 @@ def explain(
 ) -> Explanation:
     """Search, test what is left, refine; see the module."""
     search = EffectSearch(problem, rng, settings, progress)
-    selection = search.run()
+    selection = _with_whole_numbers(search, search.run())
     result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
     withdrawn: list[tuple[str, str]] = []
     while result.vetoed:
@@ -182,6 +182,24 @@ def explain(
         floor=result.floor,
         p_values=_p_values(search, selection, result),
     )
+
+
+def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection:
+    """The selection with whole numbers where a shaping parameter should be one and the recording does not object."""
+    regression, instances = selection.regression, selection.fit.instances
+    for index, instance in enumerate(instances):
+        shape = dict(instance.shape)
+        nearest = {name: float(round(shape[name])) for name in search.problem.terms[instance.term].whole}
+        if not nearest or 0.0 in nearest.values():
+            continue
+        others = (*instances[:index], *instances[index + 1 :])
+        rounded = regression.with_shape(instance, shape | nearest)
+        trial = (*instances[:index], rounded, *instances[index + 1 :])
+        loss = regression.fit(instances).log_evidence - regression.fit(trial).log_evidence
+        search.progress(f"{search.label(instance)} as {search.label(rounded)}: {loss:.1f} nats lost")
+        if loss < AMBIGUOUS and not search.repeats(rounded, others):
+            instances = trial
+    return selection if instances == selection.fit.instances else search.conclude(instances, selection.threshold)
 
 
 def _doubted(entry: NamedTerm, rival: str, undecided: Mapping[Instance, float]) -> NamedTerm:

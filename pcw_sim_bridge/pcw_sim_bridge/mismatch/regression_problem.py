@@ -84,6 +84,7 @@ class Term:
         scan: cheaper, slightly inexact columns of all `shapes` at once, (T, C, len(shapes), len(parameters)), where the
             grid is long; None uses `columns`.
         log_prior: of the effect (see there), part of every evidence.
+        whole: shaping parameters that are whole numbers unless the recording says otherwise (periods per turn).
     """
 
     effect: str
@@ -96,6 +97,7 @@ class Term:
     resolution: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
     scan: Callable[[], FloatArray] | None = None
     log_prior: float = 0.0
+    whole: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
