@@ -171,7 +171,6 @@ class AxisProblemBuilder:
         self._smooth_forces = self._plain_forces = self._explained_force(())
         periodic = self._leading_periodic()
         self._smooth_forces = self._explained_force(periodic, with_load=True)
-        self._plain_forces = self._explained_force(periodic)
         self._periodic_columns = [self._columns(effect, shape)[:, 0, :] for effect, shape in periodic]
 
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
