@@ -153,7 +153,7 @@ def explain(
         selection = search.conclude(kept, selection.threshold)
         result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
     suspect, undecided, remarks = None, {}, ()
-    refined = _refined(search, selection, result) if result.leftovers else None
+    refined = _refined(search, selection, result)
     if refined is not None:
         finished = OpenSetTest(search, refined.instances).run(selection.threshold)
         arguments = problem.terms[refined.instances[refined.position].term].arguments
@@ -255,30 +255,50 @@ class _Refined:
 
 
 def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) -> _Refined | None:
-    """The set with the one refinement switched on that gains most, if any is worth a name."""
+    """The set with the one refinement that gains most, if any explains a leftover or stands for a plain effect."""
     problem, threshold = search.problem, selection.threshold
     variables = {leftover.variable for leftover in result.leftovers}
     best: _Refined | None = None
     plain = selection.fit.instances
     before = float(np.sum(search.residual_of(plain)[problem.valid] ** 2))
-    for position, instance in enumerate(plain):
-        term = problem.terms[instance.term]
-        everything = tuple(range(len(term.parameters)))
-        if instance.active == everything or not variables & set(term.arguments):
+    for position, instances in _refinements(problem, plain):
+        leftover = bool(variables & set(problem.terms[plain[position].term].arguments))
+        own = selection.regression
+        if not leftover and own.fit(instances).log_evidence < selection.fit.log_evidence + threshold:
             continue
-        instances = (*plain[:position], dataclasses.replace(instance, active=everything), *plain[position + 1 :])
         residual = search.residual_of(instances)
         # Judged under the noise of the better model: under that of the worse one a refinement is "slow noise".
         regression = search.whiten_at(residual)
         fit, plain_fit = regression.fit(instances), regression.fit(plain)
-        gain = fit.log_evidence - plain_fit.log_evidence
+        gain = fit.log_evidence - plain_fit.log_evidence + REFINEMENT_LOG_PRIOR
         held_out = float(np.sum(regression.block_scores(plain) - regression.block_scores(instances)))
+        if gain < threshold or held_out <= 0.0 or not regression.within_bounds(fit):
+            continue
+        if best is not None and gain < best.gain:
+            continue
         share = 1.0 - float(np.sum(residual[problem.valid] ** 2)) / max(before, 1e-300)
-        worth = gain > threshold and held_out > 0.0 and share > SMALLEST_SHARE
-        if worth and regression.within_bounds(fit) and (best is None or gain > best.gain):
-            kept, undecided = _still_needed(search, regression, instances, position, plain_fit, threshold)
+        kept, undecided = _still_needed(search, regression, instances, position, plain_fit, threshold)
+        if (leftover and share > SMALLEST_SHARE) or len(kept) < len(plain):
             best = _Refined(plain, kept, kept.index(instances[position]), undecided, gain, share)
-    return best
+    return None if best is None else _searched_again(search, best, threshold)
+
+
+def _searched_again(search: EffectSearch, refined: _Refined, threshold: float) -> _Refined:
+    """The refined set with what the plain law hid added, and its other stand-ins exchanged or dropped."""
+    keeper = refined.instances[refined.position]
+    solid = tuple(instance for instance in refined.instances if instance not in refined.undecided)
+    regression = search.whiten_at(search.residual_of(refined.instances))
+    found = search.prune(regression, search.grow(regression, solid), threshold).fit.instances
+    if keeper not in found:
+        return refined
+    terms = {instance.term for instance in found}
+    undecided = {i: probability for i, probability in refined.undecided.items() if i.term not in terms}
+    # In the order of the plain set, what is new at the end.
+    order = [i for i in refined.instances if i in found or i in undecided]
+    instances = (*order, *(instance for instance in found if instance not in order))
+    return dataclasses.replace(
+        refined, instances=instances, position=instances.index(keeper), undecided=undecided
+    )
 
 
 def _still_needed(
@@ -406,13 +426,13 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     without = regression.fit(others)
     rivals = [without.log_evidence - fit.log_evidence]
     alike = []
-    for refined in _refinements(problem, others):
+    for position, refined in _refinements(problem, others):
         trial = regression.fit(refined)
         difference = trial.log_evidence + REFINEMENT_LOG_PRIOR - fit.log_evidence
         if regression.within_bounds(trial):
             rivals.append(difference)
             if difference > -AMBIGUOUS:
-                alike.append(next(problem.terms[i.term].effect for i in refined if i not in others))
+                alike.append(problem.terms[refined[position].term].effect)
     for candidate in regression.scan(others)[0]:
         same = candidate.instance.term == own.term
         if (
@@ -433,13 +453,15 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     return 1.0 / (1.0 + total), tuple(alike)
 
 
-def _refinements(problem: RegressionProblem, instances: tuple[Instance, ...]) -> Iterator[tuple[Instance, ...]]:
-    """Every set that differs by one more refined instance."""
+def _refinements(
+    problem: RegressionProblem, instances: tuple[Instance, ...]
+) -> Iterator[tuple[int, tuple[Instance, ...]]]:
+    """Every set that differs by one more refined instance, with the position of that."""
     for index, instance in enumerate(instances):
         everything = tuple(range(len(problem.terms[instance.term].parameters)))
         if instance.active != everything:
             refined = dataclasses.replace(instance, active=everything)
-            yield (*instances[:index], refined, *instances[index + 1 :])
+            yield index, (*instances[:index], refined, *instances[index + 1 :])
 
 
 def _p_values(search: EffectSearch, selection: Selection, result: OpenSetResult) -> FloatArray:
