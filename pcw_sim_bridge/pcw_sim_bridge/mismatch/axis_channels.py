@@ -170,6 +170,7 @@ class AxisProblemBuilder:
         self._scans: dict[str, FloatArray] = {}
         self._smooth_forces = self._plain_forces = self._explained_force(())
         periodic = self._leading_periodic()
+        self._smooth_forces = self._explained_force(periodic)
         self._smooth_forces = self._explained_force(periodic, with_load=True)
         self._periodic_columns = [self._columns(effect, shape)[:, 0, :] for effect, shape in periodic]
 
@@ -186,7 +187,8 @@ class AxisProblemBuilder:
 
         Args:
             periodic: effects periodic in position that take part, with their shapes.
-            with_load: include a friction that follows the load, which only effects non-linear in the force need.
+            with_load: include a friction that follows the load as it is explained so far, which only effects non-linear in
+                the force need.
 
         Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
         and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
@@ -196,7 +198,7 @@ class AxisProblemBuilder:
         speed = np.concatenate([m.velocity for m in self.motions])
         top = max(float(np.quantile(np.abs(speed), 0.99)), 1e-12)
 
-        def basis(m: AxisMotion) -> FloatArray:
+        def basis(m: AxisMotion, load: FloatArray | None) -> FloatArray:
             sign = np.tanh(m.velocity / (0.02 * top))
             a, v = m.acceleration, m.velocity
             columns = [a, v, sign, np.ones_like(sign)]
@@ -204,14 +206,16 @@ class AxisProblemBuilder:
                 columns.append(np.sin(m.position - axis.gravity_arm.hanging_position))
             for effect, shape in periodic:
                 columns.extend(effect.regressor(m.position, v, m.force, np.zeros_like(v), shape).values())
-            return np.stack([*columns, np.abs(a) * sign] if with_load else columns, axis=1)
+            return np.stack(columns if load is None else [*columns, np.abs(load) * sign], axis=1)
 
-        stacked = np.concatenate([basis(m) for m in self.motions])
+        loads = self._smooth_forces if with_load else [None] * len(self.motions)
+        parts = [basis(m, load) for m, load in zip(self.motions, loads, strict=True)]
+        stacked = np.concatenate(parts)
         force = np.concatenate([m.force for m in self.motions])
         size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
         solution, *_ = np.linalg.lstsq(stacked / size, force, rcond=1e-8)
         scaled = solution / size
-        return [basis(m) @ scaled for m in self.motions]
+        return [part @ scaled for part in parts]
 
     def choose_smoothing(self) -> float:
         """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares."""
@@ -311,6 +315,9 @@ class AxisProblemBuilder:
             predicted = predicted + arm.moment * shape
             deviation = _deviation(axis, "gravity_moment", arm.moment)
             nuisances.append(Nuisance("gravity_moment", "N m", arm.moment, deviation, shape[:, None]))
+            lean = self._filtered([-arm.moment * np.cos(m.position - arm.hanging_position) for m in self.motions])
+            deviation = _deviation(axis, "hanging_position", 1.0)
+            nuisances.append(Nuisance("hanging_position", "rad", arm.hanging_position, deviation, lean[:, None]))
         skew = self._skew()
         period = min(float(np.median(np.diff(recording.time))) for recording in self.recordings)
         nuisances.append(
