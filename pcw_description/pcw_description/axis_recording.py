@@ -75,6 +75,7 @@ DEFAULT_TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
     "rotary": {
         "inertia": Tolerance(0.05, "kg m^2", True),
         "gravity_moment": Tolerance(0.05, "N m", True),
+        "hanging_position": Tolerance(0.02, "rad", False),
         "clock_offset": _CLOCK,
     },
 }

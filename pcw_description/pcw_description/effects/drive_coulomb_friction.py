@@ -39,7 +39,7 @@ EFFECT = JointTorqueEffect(
         EffectParameter("coulomb", "N m", "friction torque, mean of both directions", 0.0, 1e4, 1.0, linear=True),
         EffectParameter(
             "asymmetry", "N m", "half the difference of the friction forwards and backwards", -1e4, 1e4, 0.2, default=0.0,
-            linear=True,
+            linear=True, clause=", asymmetric by {asymmetry:+.3g} N m forwards and the opposite backwards",
         ),
         SMOOTHING_SPEED,
     ),

@@ -22,7 +22,7 @@ EFFECT = JointTorqueEffect(
         EffectParameter("viscous", "N m s/rad", "friction per speed, mean of both directions", 0.0, 1e5, 0.1, linear=True),
         EffectParameter(
             "asymmetry", "N m s/rad", "half the difference of the friction forwards and backwards", -1e5, 1e5, 0.02,
-            default=0.0, linear=True,
+            default=0.0, linear=True, clause=", asymmetric by {asymmetry:+.3g} N m s/rad forwards and the opposite backwards",
         ),
     ),
     sensors=("joint_states",),

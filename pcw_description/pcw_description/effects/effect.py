@@ -31,6 +31,7 @@ class EffectParameter:
         reciprocal: its inverse is so: the effect vanishes as the parameter grows.
         neutral: of a near-linear parameter that is neutral at the described value instead of zero: where in the
             description that stands, as "contact.relaxation_length".
+        clause: what the effect's sentence goes on with where the number is not its default; `{name}` stands for it.
     """
 
     name: str
@@ -44,6 +45,7 @@ class EffectParameter:
     near_linear: bool = False
     reciprocal: bool = False
     neutral: str = ""
+    clause: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,4 +128,5 @@ class Effect:
         """Return one plain sentence that states the effect with its numbers, at `axis` (default: the effect's own)."""
         filled: dict[str, Any] = {parameter.name: parameter.default for parameter in self.parameters} | dict(parameters)
         joint = {"drive": "drive", "steer": "steering"}.get(axis or self.axis, "")
-        return self.sentence.format(target=" and ".join(target), joint=joint, **filled)
+        clauses = "".join(p.clause for p in self.parameters if filled[p.name] != p.default)
+        return (self.sentence.removesuffix(".") + clauses + ".").format(target=" and ".join(target), joint=joint, **filled)

@@ -331,6 +331,7 @@ def _notes(
     problem = explanation.search.problem
     for label, variable in explanation.withdrawn:
         notes.append(f"{label} was withdrawn: what is left depends on {variable}, which that effect does not.")
+    notes.extend(explanation.remarks)
     names = {channel.name for channel in problem.channels}
     if "axis_force" not in names:
         if not any(name.startswith("chassis") for name in names):
@@ -347,6 +348,10 @@ def _notes(
         notes.append("What is left is not noise; the names above explain their part of it and no more.")
     if unfinished and explanation.refinement is not None:
         notes.append(f"First suspect for what is left: {explanation.refinement.describe()}.")
+    numbers = {nuisance.name for nuisance in problem.nuisances}
+    rotary = problem.channels[0].name == "axis_force" and problem.channels[0].unit == "N m"
+    if rotary and "gravity_moment" not in numbers and any(left.variable == "position" for left in explanation.leftovers):
+        notes.append("What depends on the angle may be gravity on an arm: give the description a gravity_arm.")
     if ran_away:
         notes.append(f"Driven by the measured torques the simulation ran away in {', '.join(ran_away)}.")
     share = float(problem.valid.mean())

@@ -47,8 +47,9 @@ PREFILTER_RATIO = 2.5
 ALLOWED_DERIVATIVE_NOISE = 0.05
 SHORTEST_SEGMENT = 1.0  # [s]
 LARGEST_ORDER_GRID = 1500
-# Coggings that take part in choosing the smoothing: so many, each explaining this part of what the others leave.
-LEADING_PERIODIC, SMALLEST_PERIODIC = 3, 0.1
+# Coggings that count as known when a force is predicted or the smoothing chosen: so many, each explaining such a part of
+# what the others leave, and such a part of the measured force.
+LEADING_PERIODIC, SMALLEST_PERIODIC, SMALLEST_PERIODIC_FORCE = 8, 0.05, 0.003
 # Parameters that only smooth a sign: one value serves all effects of an axis, chosen once.
 SMOOTHING = "smoothing_speed"
 
@@ -166,8 +167,12 @@ class AxisProblemBuilder:
         }
         self._acceleration = self._variables["acceleration"]
         self._valid = self._filtered([m.still for m in self.motions]) < 0.1
-        self._smooth_forces = self._explained_force(with_load=True)
-        self._plain_forces = self._explained_force(with_load=False)
+        self._scans: dict[str, FloatArray] = {}
+        self._smooth_forces = self._plain_forces = self._explained_force(())
+        periodic = self._leading_periodic()
+        self._smooth_forces = self._explained_force(periodic)
+        self._smooth_forces = self._explained_force(periodic, with_load=True)
+        self._periodic_columns = [self._columns(effect, shape)[:, 0, :] for effect, shape in periodic]
 
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         """Channel filter on full-rate arrays of all motions, joined: [(T_i, ...)] -> (T, ...)."""
@@ -175,31 +180,42 @@ class AxisProblemBuilder:
             [self.filters[m.recording].apply(p) for m, p in zip(self.motions, pieces, strict=True)]
         )
 
-    def _explained_force(self, with_load: bool) -> list[FloatArray]:
+    def _explained_force(
+        self, periodic: Sequence[tuple[JointTorqueEffect, Shape]], with_load: bool = False
+    ) -> list[FloatArray]:
         """The force as the simplest models of a drive would have it, at full rate.
 
         Args:
-            with_load: include a friction that follows the load, which only effects non-linear in the force need.
+            periodic: effects periodic in position that take part, with their shapes.
+            with_load: include a friction that follows the load as it is explained so far, which only effects non-linear in
+                the force need.
 
         Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
         and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
         do not have: an error of the torque constant scales what is explained, it explains nothing by itself.
         """
+        axis = self.axis
         speed = np.concatenate([m.velocity for m in self.motions])
         top = max(float(np.quantile(np.abs(speed), 0.99)), 1e-12)
 
-        def basis(m: AxisMotion) -> FloatArray:
+        def basis(m: AxisMotion, load: FloatArray | None) -> FloatArray:
             sign = np.tanh(m.velocity / (0.02 * top))
             a, v = m.acceleration, m.velocity
             columns = [a, v, sign, np.ones_like(sign)]
-            return np.stack([*columns, np.abs(a) * sign] if with_load else columns, axis=1)
+            if axis.gravity_arm is not None:
+                columns.append(np.sin(m.position - axis.gravity_arm.hanging_position))
+            for effect, shape in periodic:
+                columns.extend(effect.regressor(m.position, v, m.force, np.zeros_like(v), shape).values())
+            return np.stack(columns if load is None else [*columns, np.abs(load) * sign], axis=1)
 
-        stacked = np.concatenate([basis(m) for m in self.motions])
+        loads = self._smooth_forces if with_load else [None] * len(self.motions)
+        parts = [basis(m, load) for m, load in zip(self.motions, loads, strict=True)]
+        stacked = np.concatenate(parts)
         force = np.concatenate([m.force for m in self.motions])
         size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
         solution, *_ = np.linalg.lstsq(stacked / size, force, rcond=1e-8)
         scaled = solution / size
-        return [basis(m) @ scaled for m in self.motions]
+        return [part @ scaled for part in parts]
 
     def choose_smoothing(self) -> float:
         """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares."""
@@ -218,7 +234,7 @@ class AxisProblemBuilder:
         companions = ("drive_viscous_friction", "constant_load")
         fixed = [self._acceleration[:, None], self._skew()[:, None]]
         fixed += [self._columns(all_effects()[name], {})[:, 0, :] for name in companions]  # type: ignore[arg-type]
-        fixed += self._leading_periodic([*fixed, *friction_columns(0.005 * top, 0.12)])
+        fixed += self._periodic_columns
 
         def misfit(smoothing: float) -> float:
             # Further shapes are tried, too: a curve of the wrong width would be mended by the smoothing.
@@ -242,31 +258,33 @@ class AxisProblemBuilder:
         right = scaled.T @ force
         return float(force @ force - right @ np.linalg.lstsq(scaled.T @ scaled, right, rcond=1e-12)[0])
 
-    def _leading_periodic(self, columns: Sequence[FloatArray]) -> list[FloatArray]:
-        """Columns of the strongest effects periodic in position, beside given columns: up to three that matter.
-
-        Without them a cogging would choose the smoothing.
-        """
+    def _leading_periodic(self) -> list[tuple[JointTorqueEffect, Shape]]:
+        """The strongest effects periodic in position with their shapes, beside the simplest model of a drive."""
         valid = self._valid
-        found: list[FloatArray] = []
+        force = self._force[valid]
+        columns = [self._filtered(self._smooth_forces)[:, None], np.ones((len(valid), 1))]
+        columns += [self._variables[name][:, None] for name in ("velocity", "acceleration")]
+        found: list[tuple[JointTorqueEffect, Shape]] = []
         for effect in candidate_effects():
             term = self._term(effect, 1.0)
             if term.scan is None:
                 continue
             scanned = term.scan()[valid, 0]
+            flat = scanned.reshape(len(scanned), -1)
             for _ in range(LEADING_PERIODIC):
-                known, _ = np.linalg.qr(np.concatenate([*columns, *found], axis=1)[valid])
-                left = self._force[valid] - known @ (known.T @ self._force[valid])
-                flat = scanned.reshape(len(scanned), -1)
-                free = (flat - known @ (known.T @ flat)).reshape(scanned.shape)
-                grams = np.einsum("tsp,tsq->spq", free, free)
-                right = np.einsum("tsp,t->sp", free, left)
+                known, _ = np.linalg.qr(np.concatenate(columns, axis=1)[valid])
+                left = force - known @ (known.T @ force)
+                overlap = (known.T @ flat).reshape(-1, *scanned.shape[1:])
+                grams = np.einsum("tsp,tsq->spq", scanned, scanned) - np.einsum("ksp,ksq->spq", overlap, overlap)
+                right = (left @ flat).reshape(scanned.shape[1:])
                 grams += 1e-6 * np.trace(grams, axis1=1, axis2=2)[:, None, None] * np.eye(grams.shape[2]) + 1e-300
                 gains = np.einsum("sp,sp->s", right, np.linalg.solve(grams, right[..., None])[..., 0])
                 best = int(np.argmax(gains))
-                if gains[best] < SMALLEST_PERIODIC * float(left @ left):
+                least = SMALLEST_PERIODIC * float(left @ left), SMALLEST_PERIODIC_FORCE * float(force @ force)
+                if gains[best] < max(least):
                     break
-                found.append(term.columns(term.shapes[best])[:, 0, :])
+                found.append((effect, term.shapes[best]))
+                columns.append(term.columns(term.shapes[best])[:, 0, :])
         return found
 
     def _skew(self) -> FloatArray:
@@ -297,6 +315,9 @@ class AxisProblemBuilder:
             predicted = predicted + arm.moment * shape
             deviation = _deviation(axis, "gravity_moment", arm.moment)
             nuisances.append(Nuisance("gravity_moment", "N m", arm.moment, deviation, shape[:, None]))
+            lean = self._filtered([-arm.moment * np.cos(m.position - arm.hanging_position) for m in self.motions])
+            deviation = _deviation(axis, "hanging_position", 1.0)
+            nuisances.append(Nuisance("hanging_position", "rad", arm.hanging_position, deviation, lean[:, None]))
         skew = self._skew()
         period = min(float(np.median(np.diff(recording.time))) for recording in self.recordings)
         nuisances.append(
@@ -386,6 +407,7 @@ class AxisProblemBuilder:
             arguments=kernel_arguments(effect.name),
             repeatable=periodic is not None,
             resolution=resolution,
+            whole=(periodic,) if periodic is not None and self.axis.kind == "rotary" else (),
             scan=(lambda: self._periodic_scan(effect, shapes, periodic)) if periodic is not None else None,
         )
 
@@ -428,8 +450,10 @@ class AxisProblemBuilder:
         The filter's attenuation at the local frequency k v / 2 pi stands for filtering at the full rate, which for a
         thousand orders would take a minute.
         """
+        if effect.name in self._scans:
+            return self._scans[effect.name]
         position, velocity = self._variables["position"], self._variables["velocity"]
-        force, zero = self._variables_force(), np.zeros_like(position)
+        force, zero = self._filtered(self._smooth_forces), np.zeros_like(position)
         width = len(effect.linear_parameters)
         scanned: FloatArray = np.empty((len(position), 1, len(shapes), width))
         for index, shape in enumerate(shapes):
@@ -437,10 +461,8 @@ class AxisProblemBuilder:
             attenuation = self.filters[0].gain(shape[name] * velocity / (2.0 * np.pi))
             for column, parameter in enumerate(effect.linear_parameters):
                 scanned[:, 0, index, column] = -by_name[parameter.name] * attenuation
+        self._scans[effect.name] = scanned
         return scanned
-
-    def _variables_force(self) -> FloatArray:
-        return self._filtered(self._smooth_forces)
 
 
 def _deviation(axis: AxisDescription, name: str, nominal: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,17 +65,31 @@ class AxisSubject:
     def statement(self, instance: EffectInstance) -> str:
         """Return the plain sentence, in the axis's units."""
         sentence = get(instance.name).statement(("the axis",), instance.parameters)
+        if self.axis.kind == "rotary" and instance.parameters.get("order") == 1.0:
+            cosine, sine = instance.parameters["cosine"], instance.parameters["sine"]
+            sentence = sentence.removesuffix(".") + (
+                f", or gravity on an arm of {math.hypot(cosine, sine):.3g} N m that hangs at {math.atan2(cosine, -sine):.3g} rad."
+            )
         sentence = sentence.replace("the drive of the axis", "the axis")
         for index, unit in enumerate(_LINEAR_WORDS):
             sentence = sentence.replace(f" {unit}", f" \0{index}")
         for index, unit in enumerate(_LINEAR_WORDS):
             sentence = sentence.replace(f"\0{index}", self.axis.unit(unit))
-        return sentence
+        return sentence.replace("per radian", "per metre") if self.axis.kind == "linear" else sentence
 
     def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> AxisSubject:
-        """Return the axis with effects added and its inertia as the recordings have it."""
+        """Return the axis with effects added, its inertia and arm as the recordings have them."""
+        arm = self.axis.gravity_arm
+        if arm is not None:
+            moment = retuned.get("gravity_moment", arm.moment)
+            arm = dataclasses.replace(
+                arm, moment=moment, hanging_position=retuned.get("hanging_position", arm.hanging_position)
+            )
         axis = dataclasses.replace(
-            self.axis, physics=(*self.axis.physics, *effects), inertia=retuned.get("inertia", self.axis.inertia)
+            self.axis,
+            physics=(*self.axis.physics, *effects),
+            inertia=retuned.get("inertia", self.axis.inertia),
+            gravity_arm=arm,
         )
         subject = AxisSubject(axis)
         subject._cutoff, subject._smoothing = self._cutoff, self._smoothing

@@ -8,6 +8,7 @@ here is used by the analyser.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -49,6 +50,7 @@ def _simulate(  # type: ignore[no-untyped-def]
     acceleration,
     disturbance,
     inertia,
+    gravity,
     stiffness,
     damping,
     step,
@@ -61,12 +63,13 @@ def _simulate(  # type: ignore[no-untyped-def]
     for k in range(samples):
         force = (
             inertia * acceleration[k]
+            + gravity * math.sin(reference[k])
             + stiffness * (reference[k] - position)
             + damping * (speed[k] - velocity)
         )
         positions[k], forces[k] = position, force
         for _ in range(substeps):
-            total = force + disturbance[k]
+            total = force + disturbance[k] - gravity * math.sin(position)
             start = 0
             for index in range(len(kernels)):
                 added, _ = kernels[index](
@@ -130,6 +133,10 @@ def draw_bench_case(
     overrides: Mapping[str, Mapping[str, float]] | None = None,
     noise: float | None = None,
     recordings: int = 1,
+    kind: str | None = None,
+    travel: float | None = None,
+    gravity: float = 0.0,
+    described_arm: Mapping[str, float] | None = None,
 ) -> BenchCase:
     """Draw a case.
 
@@ -139,10 +146,16 @@ def draw_bench_case(
         motion: one of `MOTIONS`; None draws it.
         overrides: parameters by effect, in multiples of the size that `magnitude` gives.
         noise: of the force sensor against the rms of the inertial force; None draws 0.5 to 5 %.
+        kind: "linear" or "rotary"; travel: about what the motion spans [m or rad]; None draws them.
+        gravity: largest torque of an arm that hangs at position 0, against the rms of the inertial force.
+        described_arm: that arm as the description has it: its `moment` against the true one, its `hanging_position` [rad];
+            empty for one that is right, None if the description has none.
     """
-    kind = str(rng.choice(["linear", "rotary"]))
+    drawn = str(rng.choice(["linear", "rotary"]))
+    kind = kind or drawn
     inertia = 10.0 ** rng.uniform(-3.0, 2.0)
-    travel = 10.0 ** rng.uniform(-0.7, 0.3) if kind == "linear" else 10.0 ** rng.uniform(0.3, 1.5)
+    spans = 10.0 ** rng.uniform(-0.7, 0.3) if kind == "linear" else 10.0 ** rng.uniform(0.3, 1.5)
+    travel = spans if travel is None else travel
     top_speed = travel * rng.uniform(0.5, 2.5)
     rate = float(rng.choice([200.0, 500.0, 1000.0]))
     duration = rng.uniform(15.0, 40.0)
@@ -151,6 +164,7 @@ def draw_bench_case(
     speed = np.gradient(references[0], 1.0 / rate)
     force_scale = inertia * float(np.std(np.gradient(speed, 1.0 / rate)))
     speed_scale = float(np.sqrt(np.mean(speed**2)))
+    moment = gravity * force_scale
     truth = tuple(
         _instance(name, magnitude * force_scale, speed_scale, travel, rng, (overrides or {}).get(name, {}))
         for name in effects
@@ -166,12 +180,13 @@ def draw_bench_case(
             "inertia": inertia,
             "tolerances": {"inertia": "2 %"},
         }
+        | ({} if described_arm is None else {"gravity_arm": {**described_arm, "moment": moment * described_arm.get("moment", 1.0)}})
     )
     true_inertia = inertia * (1.0 + 0.02 * float(np.clip(rng.standard_normal(), -2.5, 2.5)))
     level = noise if noise is not None else 10.0 ** rng.uniform(-2.3, -1.3)
     made = []
     for index, reference in enumerate(references):
-        position, force = _run(reference, rate, true_inertia, truth, level * force_scale, rng)
+        position, force = _run(reference, rate, true_inertia, moment, truth, level * force_scale, rng)
         measured = np.round(position / resolution) * resolution + 0.3 * resolution * rng.standard_normal(
             len(position)
         )
@@ -195,6 +210,7 @@ def _run(
     reference: FloatArray,
     rate: float,
     inertia: float,
+    gravity: float,
     truth: Sequence[EffectInstance],
     disturbance: float,
     rng: np.random.Generator,
@@ -219,6 +235,7 @@ def _run(
         acceleration,
         pushes,
         inertia,
+        gravity,
         inertia * bandwidth**2,
         2.0 * inertia * bandwidth,
         1.0 / rate,

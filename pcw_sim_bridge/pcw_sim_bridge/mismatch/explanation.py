@@ -3,29 +3,35 @@
     explanation = explain(problem, rng)
 
 runs the search, the open-set test and, where something is left that depends on an argument of a named effect, tries the
-refinements of that effect (a friction that differs forwards and backwards). A refined law is adopted if it completes the
-explanation and every plain effect stays beside it. Otherwise the plain law stays, and the refinement is reported with the
-leftover: it is the first suspect for physics that the library does not hold in full. A plain effect that the refinement
-would put out (an offset, by a friction that differs between directions) is said to be ambiguous with it: what decides
-between them is the shape of what is left, and that may have a third cause.
+refinements of that effect (a friction that differs forwards and backwards). A refined law is adopted if it gains more
+evidence than a name needs, lowers the error on held-out blocks, and leaves nothing that depends on its arguments.
+Otherwise the plain law stays, and the refinement is reported with the leftover: it is the first suspect for physics that
+the library does not hold in full.
+
+A refinement may stand for what a plain effect stood for before (an asymmetry of friction for an offset). That effect is
+put out only where the recording decides against it, by the odds that separate look-alikes. Where it does not decide, the
+effect keeps its name, its interval from the joint fit and its probability, and is said to be ambiguous with the refined
+one. Whether it is there was asked with its size under the plain law as the scale: a wider one would rule out any effect.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from scipy import stats
 
 from .evidence_selection import EffectSearch, Progress, Selection, SelectionSettings
-from .open_set import Leftover, OpenSetResult, OpenSetTest
+from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest
 from .regression_problem import FloatArray, RegressionProblem, Term
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
 AMBIGUOUS = 3.0
+# What a refinement of a named effect has to make up for against a further plain effect: the plain laws come first.
+REFINEMENT_LOG_PRIOR = -3.0
 # 95 % of a Gaussian: half-width in deviations, and drop of the log likelihood.
 HALF_WIDTH, DROP = 1.96, 1.92
 # Widest profile interval of a shaping parameter that is searched on a logarithmic scale.
@@ -102,6 +108,7 @@ class Explanation:
         leftovers: dependences that nothing named explains, strongest first.
         withdrawn: names that a leftover explains better: (label, variable).
         refinement: a refined law that was not adopted; None if there is none, or if it was adopted.
+        remarks: what an adopted refinement changed, in plain sentences.
         floor: rms of each channel that nothing measured explains (C,).
         p_values: of each channel holding noise and tolerances only (C,).
     """
@@ -112,6 +119,7 @@ class Explanation:
     leftovers: tuple[Leftover, ...]
     withdrawn: tuple[tuple[str, str], ...]
     refinement: Refinement | None
+    remarks: tuple[str, ...]
     floor: FloatArray
     p_values: FloatArray
 
@@ -134,7 +142,7 @@ def explain(
 ) -> Explanation:
     """Search, test what is left, refine; see the module."""
     search = EffectSearch(problem, rng, settings, progress)
-    selection = search.run()
+    selection = _with_whole_numbers(search, search.run())
     result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
     withdrawn: list[tuple[str, str]] = []
     while result.vetoed:
@@ -144,88 +152,195 @@ def explain(
         kept = [other for other in selection.fit.instances if other != instance]
         selection = search.conclude(kept, selection.threshold)
         result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
-    refinement = None
-    if result.leftovers:
-        refined = _refined(search, selection, result)
-        if refined is not None:
-            instances, gain, share = refined
-            terms = {i.term for i in instances}
-            dropped = {problem.terms[i.term].effect for i in selection.fit.instances if i.term not in terms}
-            finished = OpenSetTest(search, instances).run(selection.threshold)
-            if not finished.leftovers and not dropped:
-                progress("a refined law completes the explanation")
-                selection, result = search.conclude(instances, selection.threshold), finished
-            else:
-                better = search.conclude(instances, selection.threshold)
-                refinement = Refinement(named_terms(search, better), tuple(sorted(dropped)), gain, share)
-                progress(f"not adopted: {refinement.describe()}")
+    suspect, undecided, remarks = None, {}, ()
+    refined = _refined(search, selection, result)
+    if refined is not None:
+        finished = OpenSetTest(search, refined.instances).run(selection.threshold)
+        arguments = problem.terms[refined.instances[refined.position].term].arguments
+        better = search.conclude(refined.instances, selection.threshold)
+        if not finished.vetoed and not {left.variable for left in finished.leftovers} & set(arguments):
+            progress(f"refined: {search.label(refined.instances[refined.position])}, {refined.gain:.1f} nats")
+            remarks = _remarks(search, selection, refined)
+            selection, result, undecided = better, finished, refined.undecided
+        else:
+            suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
+            progress(f"not adopted: {suspect.describe()}")
     named = named_terms(search, selection)
-    if refinement is not None:
-        named = tuple(_doubted(entry, refinement) for entry in named)
+    if refined is not None:
+        rival = problem.terms[refined.instances[refined.position].term].effect
+        if suspect is not None:
+            undecided = {entry.instance: entry.probability for entry in named if entry.term.effect in suspect.dropped}
+        named = tuple(_doubted(entry, rival, undecided) for entry in named)
     return Explanation(
         search=search,
         selection=selection,
         named=named,
         leftovers=result.leftovers,
         withdrawn=tuple(withdrawn),
-        refinement=refinement,
+        refinement=suspect,
+        remarks=remarks,
         floor=result.floor,
         p_values=_p_values(search, selection, result),
     )
 
 
-def _doubted(entry: NamedTerm, refinement: Refinement) -> NamedTerm:
-    """The entry, said to be ambiguous with the refined effects if these would do without it."""
-    if entry.term.effect not in refinement.dropped:
+def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection:
+    """The selection with whole numbers where a shaping parameter should be one and the recording does not object."""
+    regression, instances = selection.regression, selection.fit.instances
+    for index, instance in enumerate(instances):
+        shape = dict(instance.shape)
+        nearest = {name: float(round(shape[name])) for name in search.problem.terms[instance.term].whole}
+        if not nearest or 0.0 in nearest.values():
+            continue
+        others = (*instances[:index], *instances[index + 1 :])
+        rounded = regression.with_shape(instance, shape | nearest)
+        trial = (*instances[:index], rounded, *instances[index + 1 :])
+        loss = regression.fit(instances).log_evidence - regression.fit(trial).log_evidence
+        search.progress(f"{search.label(instance)} as {search.label(rounded)}: {loss:.1f} nats lost")
+        if loss < AMBIGUOUS and not search.repeats(rounded, others):
+            instances = trial
+    return selection if instances == selection.fit.instances else search.conclude(instances, selection.threshold)
+
+
+def _doubted(entry: NamedTerm, rival: str, undecided: Mapping[Instance, float]) -> NamedTerm:
+    """The entry, said to be ambiguous with a refined effect if the recording does not decide between them."""
+    if entry.instance not in undecided:
         return entry
-    rivals = (other.term.effect for other in refinement.named if any(
-        p.refinement and p.name in other.estimates for p in other.term.parameters
-    ))
-    return dataclasses.replace(entry, ambiguous_with=tuple(dict.fromkeys((*entry.ambiguous_with, *rivals))))
+    return dataclasses.replace(entry, ambiguous_with=(rival,), probability=undecided[entry.instance])
 
 
-def _refined(
-    search: EffectSearch, selection: Selection, result: OpenSetResult
-) -> tuple[tuple[Instance, ...], float, float] | None:
-    """The best set with one or more refinements switched on and what they make redundant left out, if it is better."""
+def _remarks(search: EffectSearch, plain: Selection, refined: _Refined) -> tuple[str, ...]:
+    """What became of the effects that an adopted refinement can stand for."""
+    problem = search.problem
+    law = problem.terms[refined.instances[refined.position].term].effect
+    remarks = []
+    for instance, values in zip(plain.fit.instances, _estimates(problem, plain.fit), strict=True):
+        term = problem.terms[instance.term]
+        if instance in refined.instances and instance not in refined.undecided:
+            continue
+        if term.effect == law:
+            continue
+        fate = "do not decide whether it is there" if instance in refined.undecided else "decide against it"
+        numbers = " and ".join(
+            f"{term.parameters[k].name} = {value:.3g} {term.parameters[k].unit}"
+            for k, value in zip(instance.active, values, strict=True)
+        )
+        remarks.append(f"With a symmetric {law} there would be {term.effect} ({numbers}); with the refined one the recordings {fate}.")
+    return tuple(remarks)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Refined:
+    """A set with one instance refined.
+
+    Attributes:
+        plain: the set before.
+        instances: the refined set, without what the recording decides against.
+        position: of the refined instance.
+        undecided: probability of instances that the refined set does as well without.
+        gain: nats over the plain set; share: part of its remaining mean square that is explained.
+    """
+
+    plain: tuple[Instance, ...]
+    instances: tuple[Instance, ...]
+    position: int
+    undecided: dict[Instance, float]
+    gain: float
+    share: float
+
+    def put_out(self, search: EffectSearch) -> tuple[str, ...]:
+        """Effects of the plain set that the refined one has no need of."""
+        left = {instance.term for instance in self.instances if instance not in self.undecided}
+        return tuple(sorted({search.problem.terms[i.term].effect for i in self.plain if i.term not in left}))
+
+
+def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) -> _Refined | None:
+    """The set with the one refinement that gains most, if any explains a leftover or stands for a plain effect."""
     problem, threshold = search.problem, selection.threshold
     variables = {leftover.variable for leftover in result.leftovers}
-    best: tuple[tuple[Instance, ...], float, float] | None = None
+    best: _Refined | None = None
     plain = selection.fit.instances
     before = float(np.sum(search.residual_of(plain)[problem.valid] ** 2))
-    for index, instance in enumerate(plain):
-        term = problem.terms[instance.term]
-        everything = tuple(range(len(term.parameters)))
-        if instance.active == everything or not variables & set(term.arguments):
+    for position, instances in _refinements(problem, plain):
+        leftover = bool(variables & set(problem.terms[plain[position].term].arguments))
+        own = selection.regression
+        if not leftover and own.fit(instances).log_evidence < selection.fit.log_evidence + threshold:
             continue
-        instances = (*plain[:index], dataclasses.replace(instance, active=everything), *plain[index + 1 :])
+        residual = search.residual_of(instances)
         # Judged under the noise of the better model: under that of the worse one a refinement is "slow noise".
-        regression = search.whiten_at(search.residual_of(instances))
-        plain_evidence = regression.fit(plain).log_evidence
-        instances = _without_redundant(search, regression, instances, threshold)
+        regression = search.whiten_at(residual)
+        fit, plain_fit = regression.fit(instances), regression.fit(plain)
+        gain = fit.log_evidence - plain_fit.log_evidence + REFINEMENT_LOG_PRIOR
+        held_out = float(np.sum(regression.block_scores(plain) - regression.block_scores(instances)))
+        if gain < threshold or held_out <= 0.0 or not regression.within_bounds(fit):
+            continue
+        if best is not None and gain < best.gain:
+            continue
+        share = 1.0 - float(np.sum(residual[problem.valid] ** 2)) / max(before, 1e-300)
+        kept, undecided = _still_needed(search, regression, instances, position, plain_fit, threshold)
+        if (leftover and share > SMALLEST_SHARE) or len(kept) < len(plain):
+            best = _Refined(plain, kept, kept.index(instances[position]), undecided, gain, share)
+    return None if best is None else _searched_again(search, best, threshold)
+
+
+def _searched_again(search: EffectSearch, refined: _Refined, threshold: float) -> _Refined:
+    """The refined set with what the plain law hid added, and its other stand-ins exchanged or dropped."""
+    keeper = refined.instances[refined.position]
+    solid = tuple(instance for instance in refined.instances if instance not in refined.undecided)
+    regression = search.whiten_at(search.residual_of(refined.instances))
+    found = search.prune(regression, search.grow(regression, solid), threshold).fit.instances
+    if keeper not in found:
+        return refined
+    terms = {instance.term for instance in found}
+    undecided = {i: probability for i, probability in refined.undecided.items() if i.term not in terms}
+    # In the order of the plain set, what is new at the end.
+    order = [i for i in refined.instances if i in found or i in undecided]
+    instances = (*order, *(instance for instance in found if instance not in order))
+    return dataclasses.replace(
+        refined, instances=instances, position=instances.index(keeper), undecided=undecided
+    )
+
+
+def _still_needed(
+    search: EffectSearch,
+    regression: WhitenedRegression,
+    instances: tuple[Instance, ...],
+    refined: int,
+    plain_fit: Fit,
+    threshold: float,
+) -> tuple[tuple[Instance, ...], dict[Instance, float]]:
+    """The instances that the recording does not decide against, and the probability of those that it does not decide for."""
+    sizes = dict(zip(plain_fit.instances, _estimates(search.problem, plain_fit), strict=True))
+    keeper = instances[refined]
+    while True:
         fit = regression.fit(instances)
-        gain = fit.log_evidence - plain_evidence
-        share = 1.0 - float(np.sum(search.residual_of(instances)[problem.valid] ** 2)) / max(before, 1e-300)
-        if gain > threshold and regression.within_bounds(fit) and (best is None or gain > best[1]):
-            best = (instances, gain, share)
-    return best
+        losses, held_out, shares = search.judge(regression, instances, fit)
+        evidence = {}
+        for instance, loss, gain, share in zip(instances, losses, held_out, shares, strict=True):
+            if instance != keeper and (loss < threshold or gain <= 0.0 or share < 1.0):
+                evidence[instance] = _size_evidence(search.problem, fit, instance, sizes[instance])
+        against = min(evidence, key=lambda instance: evidence[instance], default=None)
+        if against is None or evidence[against] > -AMBIGUOUS:
+            return instances, {instance: 1.0 / (1.0 + math.exp(-value)) for instance, value in evidence.items()}
+        instances = tuple(instance for instance in instances if instance != against)
 
 
-def _without_redundant(
-    search: EffectSearch, regression: WhitenedRegression, instances: tuple[Instance, ...], threshold: float
-) -> tuple[Instance, ...]:
-    while len(instances) > 1:
-        losses, held_out, shares = search.judge(regression, instances, regression.fit(instances))
-        failing = [
-            (loss, k)
-            for k, (loss, gain, share) in enumerate(zip(losses, held_out, shares, strict=True))
-            if loss < threshold or gain <= 0.0 or share < 1.0
-        ]
-        if not failing:
-            break
-        _, worst = min(failing)
-        instances = instances[:worst] + instances[worst + 1 :]
-    return instances
+def _size_evidence(problem: RegressionProblem, fit: Fit, instance: Instance, size: FloatArray) -> float:
+    """Log odds that an instance is there, of about a given size (P,), against that it is not."""
+    index = fit.instances.index(instance)
+    start = len(problem.nuisances) + sum(len(other.active) for other in fit.instances[:index])
+    rows = slice(start, start + len(instance.active))
+    mean, covariance = fit.mean[rows], fit.covariance[rows, rows]
+    wide = covariance + np.diag(np.maximum(size**2, 1e-300))
+    odds = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(wide)[1]
+    odds += mean @ (np.linalg.solve(covariance, mean) - np.linalg.solve(wide, mean))
+    return 0.5 * float(odds)
+
+
+def _estimates(problem: RegressionProblem, fit: Fit) -> list[FloatArray]:
+    """Estimated active parameters of every instance of a fit."""
+    ends = np.cumsum([len(problem.nuisances), *(len(instance.active) for instance in fit.instances)])
+    return [fit.mean[start:stop] for start, stop in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, ...]:
@@ -312,6 +427,13 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     without = regression.fit(others)
     rivals = [without.log_evidence - fit.log_evidence]
     alike = []
+    for position, refined in _refinements(problem, others):
+        trial = regression.fit(refined)
+        difference = trial.log_evidence + REFINEMENT_LOG_PRIOR - fit.log_evidence
+        if regression.within_bounds(trial):
+            rivals.append(difference)
+            if difference > -AMBIGUOUS:
+                alike.append(problem.terms[refined[position].term].effect)
     for candidate in regression.scan(others)[0]:
         same = candidate.instance.term == own.term
         if (
@@ -330,6 +452,17 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
             alike.append(theirs.effect if theirs.effect != mine.effect else theirs.key)
     total = sum(math.exp(min(rival, 50.0)) for rival in rivals)
     return 1.0 / (1.0 + total), tuple(alike)
+
+
+def _refinements(
+    problem: RegressionProblem, instances: tuple[Instance, ...]
+) -> Iterator[tuple[int, tuple[Instance, ...]]]:
+    """Every set that differs by one more refined instance, with the position of that."""
+    for index, instance in enumerate(instances):
+        everything = tuple(range(len(problem.terms[instance.term].parameters)))
+        if instance.active != everything:
+            refined = dataclasses.replace(instance, active=everything)
+            yield index, (*instances[:index], refined, *instances[index + 1 :])
 
 
 def _p_values(search: EffectSearch, selection: Selection, result: OpenSetResult) -> FloatArray:

@@ -108,6 +108,7 @@ class Term:
             grid is long; None uses `columns`.
         grid_size: how many shapes `shapes` were chosen from, where a first look has narrowed them down.
         log_prior: of the effect (see there), part of every evidence.
+        whole: shaping parameters that are whole numbers unless the recording says otherwise (periods per turn).
     """
 
     effect: str
@@ -122,6 +123,7 @@ class Term:
     grid_size: int = 0
     log_prior: float = 0.0
     axis: str | None = None
+    whole: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
