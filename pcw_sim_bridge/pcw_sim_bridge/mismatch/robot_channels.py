@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from pcw_description.effects.drive_coulomb_friction import SMOOTHING_SPEED
 from pcw_description.effects.effect import Effect
 from pcw_description.effects.kinds import (
     ChassisForceEffect,
@@ -33,6 +34,7 @@ from .regression_problem import (
     Nuisance,
     RegressionProblem,
     Shape,
+    Sites,
     Term,
 )
 from .robot_effects import SEEN_KINDS, ChannelModel, Sides, with_yaw, without_reading_errors
@@ -70,7 +72,7 @@ class RobotProblemBuilder:
         Raises:
             MismatchError: neither torques nor an inertial sensor were recorded, or no piece is long enough.
         """
-        self.robot = robot
+        self.robot, self.recordings = robot, tuple(recordings)
         with_torque = all(
             r.joint_states.effort is not None and np.isfinite(r.joint_states.effort).any() for r in recordings
         )
@@ -129,6 +131,7 @@ class RobotProblemBuilder:
             terms=tuple(self._terms(measured)),
             variables=self._variables(),
             scale_deviation=self._scale_deviation(),
+            sites=self._sites() if self.balanced else None,
         )
 
     def _scale_deviation(self) -> float:
@@ -534,36 +537,89 @@ class RobotProblemBuilder:
             shapes = [{**shape, parameter.name: value} for shape in shapes for value in values if value is not None]
         return tuple(shapes), resolution
 
-    def _variables(self) -> dict[str, FloatArray]:
-        """What a leftover may depend on, each (T,)."""
+    # -- what is not in the library -----------------------------------------------------------------------------
+
+    def torque_columns(self, torques: FloatArray) -> FloatArray:
+        """Return what torques on the joints, besides the motors', add to the residual.
+
+        Args:
+            torques: joint torques along all motions on end (N, n, 2, K) [N m].
+
+        Returns:
+            (T, C, K), per unit of each of the K torques.
+        """
+        # Small against the weight, so that the tyres' curves stay straight.
+        size = np.maximum(np.sqrt(np.mean(np.sum(torques**2, axis=(1, 2)), axis=0)), 1e-12)
+        scales = 1e-2 * self.robot.total_mass * float(np.mean(self.numbers.radius)) / size
+        pieces, start = [], 0
+        for motion, (measured, predicted) in zip(self.motions, self._nominal, strict=True):
+            own = torques[start : start + len(motion.time)]
+            start += len(motion.time)
+            columns = np.zeros((len(own), measured.shape[1], len(scales)))
+            for k, scale in enumerate(scales):
+                changed = self.model.sides(motion, added_torque=scale * own[..., k])
+                columns[:, :, k] = np.nan_to_num((measured - predicted) - (changed[0] - changed[1])) / scale
+            pieces.append(columns)
+        return self._filtered(pieces)
+
+    def _sites(self) -> Sites:
+        """Every joint, and forces and a moment on the chassis."""
+        n = self.robot.n
+        joints = tuple(f"{axis}_torque/{caster}" for caster in self.robot.caster_names for axis in AXIS_NAMES)
+        lengths = np.cumsum([len(m.time) for m in self.motions])[:-1]
+
+        def columns(forces: FloatArray) -> FloatArray:
+            torques = forces[:, : 2 * n].reshape(len(forces), n, 2, -1)
+            of_joints = self.torque_columns(torques) if torques.any() else 0.0
+            wrench = np.zeros((len(forces), len(self.channels()), forces.shape[2]))
+            wrench[:, : len(WRENCH)] = -forces[:, 2 * n :]
+            result: FloatArray = of_joints + self._filtered(np.split(wrench, lengths))
+            return result
+
+        variables = {name: np.concatenate(parts) for name, parts in self._along_motions().items()}
+        return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+
+    def _place(self, motion: RobotMotion, twist: FloatArray) -> FloatArray:
+        """Where the robot is (T, 2) [m]: by a tracker, else by its wheels from where the piece begins."""
+        truth = self.recordings[motion.recording].ground_truth
+        if truth is not None and len(truth.stamp) > 1:
+            return np.stack([np.interp(motion.time, truth.stamp, truth.pose[:, k]) for k in range(2)], axis=1)
+        c, s = np.cos(motion.yaw), np.sin(motion.yaw)
+        velocity = np.stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]], axis=1)
+        place: FloatArray = np.cumsum(velocity, axis=0) / motion.rate
+        return place
+
+    def _along_motions(self) -> dict[str, list[FloatArray]]:
+        """What a leftover may depend on, one array per motion."""
         numbers = self.numbers
         variables: dict[str, list[FloatArray]] = {}
 
-        def put(name: str, filter_: SignalFilter, values: FloatArray) -> None:
-            variables.setdefault(name, []).append(filter_.apply(values))
+        def put(name: str, values: FloatArray) -> None:
+            variables.setdefault(name, []).append(np.ascontiguousarray(values))
 
-        for filter_, motion, normal in zip(self.filters, self.motions, self._normal, strict=True):
+        for motion, normal in zip(self.motions, self._normal, strict=True):
             angle = np.ascontiguousarray(motion.position[:, :, STEER])
-            twist, _ = twists(
-                numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity
-            )
-            variables.setdefault("time", []).append(filter_.decimate(motion.time))
-            put("speed", filter_, np.hypot(twist[:, 0], twist[:, 1]))
+            twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
+            put("time", motion.time)
+            put("speed", np.hypot(twist[:, 0], twist[:, 1]))
             for k, name in enumerate(("v_x", "v_y", "omega")):
-                put(name, filter_, twist[:, k])
+                put(name, twist[:, k])
+            for k, name in enumerate("xy"):
+                put(name, self._place(motion, twist)[:, k])
+            put("yaw", motion.yaw)
             for i, caster in enumerate(self.robot.caster_names):
-                put(f"steer_angle/{caster}", filter_, np.ascontiguousarray(angle[:, i]))
-                put(f"drive_angle/{caster}", filter_, np.ascontiguousarray(motion.position[:, i, DRIVE]))
-                put(f"drive_normal_force/{caster}", filter_, np.ascontiguousarray(normal[:, i]))
+                put(f"steer_angle/{caster}", angle[:, i])
+                put(f"drive_angle/{caster}", motion.position[:, i, DRIVE])
+                put(f"drive_normal_force/{caster}", normal[:, i])
                 for axis, axis_name in enumerate(AXIS_NAMES):
-                    put(
-                        f"{axis_name}_velocity/{caster}",
-                        filter_,
-                        np.ascontiguousarray(motion.velocity[:, i, axis]),
-                    )
-                    put(
-                        f"{axis_name}_torque/{caster}",
-                        filter_,
-                        np.ascontiguousarray(motion.torque[:, i, axis]),
-                    )
-        return {name: np.concatenate(parts) for name, parts in variables.items()}
+                    put(f"{axis_name}_velocity/{caster}", motion.velocity[:, i, axis])
+                    put(f"{axis_name}_torque/{caster}", motion.torque[:, i, axis])
+        return variables
+
+    def _variables(self) -> dict[str, FloatArray]:
+        """What a leftover may depend on, each (T,)."""
+        found = {}
+        for name, parts in self._along_motions().items():
+            pieces = zip(self.filters, parts, strict=True)
+            found[name] = np.concatenate([f.decimate(p) if name == "time" else f.apply(p) for f, p in pieces])
+        return found
