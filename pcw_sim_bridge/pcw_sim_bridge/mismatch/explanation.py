@@ -20,7 +20,7 @@ import numpy as np
 from scipy import stats
 
 from .evidence_selection import EffectSearch, Progress, Selection, SelectionSettings
-from .open_set import Leftover, OpenSetResult, OpenSetTest
+from .open_set import Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
 from .regression_problem import FloatArray, RegressionProblem, Term
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
@@ -135,15 +135,9 @@ def explain(
     """Search, test what is left, refine; see the module."""
     search = EffectSearch(problem, rng, settings, progress)
     selection = search.run()
-    result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
-    withdrawn: list[tuple[str, str]] = []
-    while result.vetoed:
-        instance, variable = result.vetoed[0]
-        withdrawn.append((search.label(instance), variable))
-        progress(f"withdrawn: {search.label(instance)}, the residual depends on {variable}")
-        kept = [other for other in selection.fit.instances if other != instance]
-        selection = search.conclude(kept, selection.threshold)
-        result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
+    judgement = judge(search, selection)
+    search, selection, result = judgement.search, judgement.selection, judgement.result
+    problem = search.problem
     refinement = None
     if result.leftovers:
         refined = _refined(search, selection, result)
@@ -159,7 +153,7 @@ def explain(
                 better = search.conclude(instances, selection.threshold)
                 refinement = Refinement(named_terms(search, better), tuple(sorted(dropped)), gain, share)
                 progress(f"not adopted: {refinement.describe()}")
-    named = named_terms(search, selection)
+    named = tuple(entry for entry in named_terms(search, selection) if not is_unknown(problem, entry.instance))
     if refinement is not None:
         named = tuple(_doubted(entry, refinement) for entry in named)
     return Explanation(
@@ -167,7 +161,7 @@ def explain(
         selection=selection,
         named=named,
         leftovers=result.leftovers,
-        withdrawn=tuple(withdrawn),
+        withdrawn=judgement.withdrawn,
         refinement=refinement,
         floor=result.floor,
         p_values=_p_values(search, selection, result),
