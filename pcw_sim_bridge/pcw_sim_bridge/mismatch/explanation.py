@@ -153,7 +153,10 @@ def explain(
                 better = search.conclude(instances, selection.threshold)
                 refinement = Refinement(named_terms(search, better), tuple(sorted(dropped)), gain, share)
                 progress(f"not adopted: {refinement.describe()}")
-    named = tuple(entry for entry in named_terms(search, selection) if not is_unknown(problem, entry.instance))
+    named = tuple(
+        dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
+        for entry in named_terms(search, selection) if not is_unknown(problem, entry.instance)
+    )
     if refinement is not None:
         named = tuple(_doubted(entry, refinement) for entry in named)
     return Explanation(

@@ -87,8 +87,8 @@ def _joint_torque(law: Law, weights: FloatArray, recordings: Sequence[str], take
     argument, factor = arguments[0], first.factor
     body = _body(law.basis, weights, (argument,))
     if factor.kind == "sign":
-        width = factor.width
-        lines = [f"sign = smooth_sign(velocity, {width:.9g})", f"factor, factor_slope = sign, (1.0 - sign * sign) / {width:.9g}"]
+        width = f"{factor.width:.9g}"
+        lines = [f"sign = smooth_sign(velocity, {width})", f"factor, factor_slope = sign, (1.0 - sign * sign) / {width}"]
     else:
         value = "1.0" if factor.kind == "one" else _name_of(factor.variable, seen[0])
         lines = [f"factor, factor_slope = {value}, {1.0 if value == 'velocity' else 0.0}"]

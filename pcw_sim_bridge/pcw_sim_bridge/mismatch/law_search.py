@@ -12,6 +12,7 @@ the law does: friction that varies by a tenth with the steering angle is frictio
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +25,8 @@ from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
 # Nats on top of the threshold of the names: there are more hypotheses, and they come from no list of known physics.
 LAW_MARGIN = 15.0
+# Logarithm of their number: what the best of them gains for having been chosen.
+HYPOTHESES_COST = 8.0
 # Samples of a channel count as so many fewer in the screening, where the colour of the noise is not looked at.
 SCREENING_CORRELATION = 5.0
 # At most so many samples are looked at in the screening.
@@ -46,6 +49,8 @@ class FoundLaw:
         share: part of what the remaining names leave that the law explains on held-out blocks.
         names: instances that stay.
         withdrawn: instances whose name is withdrawn.
+        counts: whether it is sure enough to be told. If not, it is a doubt about the names that it would withdraw.
+        alike: whether these names do most of what it does.
     """
 
     law: Law
@@ -54,6 +59,17 @@ class FoundLaw:
     share: float
     names: tuple[Instance, ...]
     withdrawn: tuple[Instance, ...]
+    counts: bool
+    alike: bool
+
+    @property
+    def belief(self) -> float:
+        """What is left of the probability of the names that it would withdraw.
+
+        Half of it where name and law explain nearly the same: then details of the model decide between them.
+        """
+        odds = math.exp(min(min(self.gain, self.held_out) - HYPOTHESES_COST, 50.0))
+        return max(1.0 / (1.0 + odds), 0.5 if self.alike else 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +101,7 @@ class LawSearch:
         )
 
     def run(self) -> FoundLaw | None:
-        """Return the best law if it counts."""
+        """Return the best law, whether it counts or not; None if no law looks better than nothing."""
         trials = [self._trial(law) for law in self._screened()]
         if not trials:
             return None
@@ -156,18 +172,18 @@ class LawSearch:
             f"outside the library: {' and '.join(best.law.sites)} by {', '.join(best.law.depends_on)}:"
             f" {gain:.1f} nats, held out {held_out:.1f}"
         )
-        if min(gain, held_out) < self.threshold or not self._matters(problem, with_law, without):
-            return None
+        counts = min(gain, held_out) >= self.threshold and self._matters(problem, with_law, without)
         both = max(scores[2] - scores[0], 1e-300)
         dropped = tuple(i for i in self.names if i not in best.names)
         names, withdrawn = best.names, dropped
-        if dropped and (scores[1] - scores[0]) / both < KEPT_PART:
+        alike = bool(dropped) and (scores[1] - scores[0]) / both < KEPT_PART
+        if alike and counts:
             names, withdrawn = self.names, ()
         plain = {i.term: i for i in self.plain}
         return FoundLaw(
             best.law, gain, held_out, min(both / max(scores[2], 1e-300), 1.0),
             tuple(plain[i.term] if i.term in plain else i for i in names),
-            tuple(plain[i.term] if i.term in plain else i for i in withdrawn),
+            tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
         )
 
     def _matters(self, problem: RegressionProblem, with_law: Fit, without: Fit) -> bool:
@@ -276,7 +292,7 @@ class _Screen:
     def _filtered_bases(self) -> dict[tuple[str, Factor], FloatArray]:
         """One filtered column (T, C) per site and factor."""
         wanted = list(dict.fromkeys((p.site, p.factor) for law in self.laws for p in law.places))
-        found = {}
+        found: dict[tuple[str, Factor], FloatArray] = {}
         for start in range(0, len(wanted), 8):
             keys = wanted[start : start + 8]
             first = factor_values(self.sites.variables, keys[0][1])

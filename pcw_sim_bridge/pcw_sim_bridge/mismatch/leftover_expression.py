@@ -119,13 +119,13 @@ def closed_form(basis: Basis, weights: FloatArray, covariance: FloatArray) -> Cl
     low, high = basis.knots[0][0], basis.knots[0][-1]
     grid = np.linspace(low, high, SAMPLES)
     functions = basis.functions([grid])
-    inverse = np.linalg.pinv(functions, rcond=1e-9)
+    inverse = np.asarray(np.linalg.pinv(functions, rcond=1e-9), dtype=np.float64)
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    root = np.linalg.cholesky(covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(len(weights)))
+    correlation = covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(len(weights))
+    root = np.asarray(np.linalg.cholesky(correlation), dtype=np.float64)
 
     def standard(values: FloatArray) -> FloatArray:
-        scaled: FloatArray = np.linalg.solve(root, (values.T / deviation).T)
-        return scaled
+        return np.asarray(np.linalg.solve(root, (values.T / deviation).T), dtype=np.float64)
 
     target = standard(weights)
 
@@ -208,7 +208,7 @@ def written(law: Law, weights: FloatArray) -> str | None:
         return None
     first = law.places[0]
     argument = _sum_of(first.arguments[0])
-    parts = []
+    parts: list[str] = []
     for weight, atom in zip(weights, law.basis.atoms, strict=True):
         text = "" if atom.shape is ONE else f" {atom.written(argument)}"
         sign = ("- " if weight < 0 else "+ ") if parts else ("-" if weight < 0 else "")

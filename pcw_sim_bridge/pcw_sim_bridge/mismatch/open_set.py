@@ -14,7 +14,7 @@ withdrawn and the dependence reported instead.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -89,22 +89,28 @@ class Judgement:
         search, selection: with laws that were found as further terms, called `UNKNOWN`.
         result: what is left, laws first.
         withdrawn: names that something left explains better: (label, variable).
+        beliefs: what is left of the probability of names, by term, that a law not sure enough to be told would withdraw.
     """
 
     search: EffectSearch
     selection: Selection
     result: OpenSetResult
     withdrawn: tuple[tuple[str, str], ...]
+    beliefs: Mapping[int, float]
 
 
 def judge(search: EffectSearch, selection: Selection) -> Judgement:
     """Look for laws outside the library and for dependences of channels; withdraw the names that they make redundant."""
     withdrawn: list[tuple[str, str]] = []
     found: list[tuple[Law, FoundLaw]] = []
+    beliefs: dict[int, float] = {}
     result = None
     for _ in range(LARGEST_LAWS if search.problem.sites is not None else 0):
         law = LawSearch(search, selection).run()
         if law is None:
+            break
+        if not law.counts:
+            beliefs = {i.term: law.belief for i in law.withdrawn}
             break
         before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
         search, selection, final = _adopted(search, selection, law)
@@ -125,7 +131,7 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
         search.progress(f"withdrawn: {label}, the residual depends on {variable}")
     laws = [_law_leftover(search, selection, law, how) for law, how in found]
     return Judgement(
-        search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn)
+        search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs
     )
 
 

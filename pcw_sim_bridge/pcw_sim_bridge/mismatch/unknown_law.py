@@ -89,12 +89,12 @@ class Basis:
 
     def _smooth(self) -> FloatArray:
         """Root of the prior covariance of the values at the knots: neighbours are alike, as all of them may be large."""
-        root = np.ones((1, 1))
+        root: FloatArray = np.ones((1, 1))
         for knots in self.knots:
             places = np.array(knots)
             apart = (places[:, None] - places) / (places[-1] - places[0])
             covariance = 1.0 + np.exp(-0.5 * (apart / ALIKE) ** 2) + 1e-2 * np.eye(len(places))
-            root = np.kron(root, np.linalg.cholesky(covariance))
+            root = np.asarray(np.kron(root, np.linalg.cholesky(covariance)), dtype=np.float64)
         return root
 
     def values_at_knots(self, weights: FloatArray) -> FloatArray:
