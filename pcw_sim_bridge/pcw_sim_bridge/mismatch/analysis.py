@@ -27,6 +27,8 @@ from .findings import (
     Trace,
     UnknownFinding,
 )
+from .generated_effect import NoSuchKernelError, generate
+from .open_set import Leftover, names_only
 from .regression_problem import FloatArray, RegressionProblem
 from .subject import Opened, Subject
 from .whitened_regression import Fit, WhitenedRegression, predicted
@@ -110,15 +112,12 @@ def analyse(
         channels=_channels(explanation),
         locations=tuple(_location(explanation, named) for named in explanation.named),
         effects=tuple(_effect_finding(subject, named, e) for named, e in zip(explanation.named, instances, strict=True)),
-        unknown=tuple(
-            UnknownFinding(left.channel, (left.variable,), None, float(min(left.share, 1.0)))
-            for left in leftovers
-        ),
+        unknown=_unknown(leftovers, [str(path) for path in fit]),
         retuned=retuned,
         fit=fit_finding,
         ladder=_ladder(explanation.selection.ladder),
         traces=(
-            *_traces(problem, explanation.fit, "fit"),
+            *_traces(explanation.search.problem, explanation.fit, "fit"),
             *(_traces(held_out_problem, held_out_fit, "holdout") if held_out else ()),
         ),
         notes=_notes(explanation, retuned, bool(held_out), bool(leftovers), ran_away),
@@ -135,6 +134,23 @@ def effect_instance(named: NamedTerm) -> EffectInstance:
     # Rounding of an estimate at its bound must not make a file that its own reader refuses.
     bounded = {p.name: min(max(values[p.name], p.lower), p.upper) for p in effect.parameters}
     return EffectInstance(named.term.effect, named.term.target, bounded, named.term.axis)
+
+
+def _unknown(leftovers: Sequence[Leftover], recordings: Sequence[str]) -> tuple[UnknownFinding, ...]:
+    """What is left, with a file for every law that the kernel of an effect can hold."""
+    found: list[UnknownFinding] = []
+    for left in leftovers:
+        effect, reason = None, ""
+        if left.law is not None:
+            taken = [other.effect.name for other in found if other.effect is not None]
+            try:
+                effect = generate(left.law, left.weights, recordings, taken)
+            except NoSuchKernelError as error:
+                reason = str(error)
+        variables = left.depends_on or (left.variable,)
+        share = float(min(left.share, 1.0))
+        found.append(UnknownFinding(left.channel, variables, left.expression, share, effect, reason))
+    return tuple(found)
 
 
 def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance) -> EffectFinding:
@@ -255,7 +271,7 @@ def _prove(
     regression = selection.regression
     if held_out:
         proof = subject.problem(held_out)
-        fit, rows = selection.fit, proof.valid
+        fit, rows = names_only(problem, selection.fit), proof.valid
         source = "held-out recording" + ("s" if len(held_out) > 1 else "")
     else:
         last = np.zeros(len(problem.time), dtype=bool)
@@ -265,7 +281,8 @@ def _prove(
         seen = dataclasses.replace(problem, valid=problem.valid & ~last[:, None])
         weights = np.ones_like(problem.residual)
         refit = WhitenedRegression(seen, regression.noise, weights, np.zeros(len(problem.time), dtype=np.int64))
-        proof, fit, rows = problem, refit.fit(selection.fit.instances), problem.valid & last[:, None]
+        fit = names_only(problem, refit.fit(selection.fit.instances))
+        proof, rows = problem, problem.valid & last[:, None]
         source = f"last {100 * HELD_OUT_PART:.0f} % of each recording, refitted without it"
     spread = np.maximum(_rms(proof.measured - _mean(proof.measured, rows), rows), 1e-300)
     before = _nrmse(proof.residual, rows, spread)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from .regression_problem import (
     Nuisance,
     RegressionProblem,
     Shape,
+    Sites,
     Term,
 )
 from .signal_filter import SignalFilter, derivative, refined, uniform_segments, white_noise_level
@@ -351,7 +352,23 @@ class AxisProblemBuilder:
             nuisances=tuple(nuisances),
             terms=tuple(terms),
             variables=variables,
+            sites=self._sites(start, smoothing),
         )
+
+    def _sites(self, start: Mapping[int, float], smoothing: float) -> Sites:
+        """The axis itself; `start` is the first instant of each recording [s]."""
+        motions = self.motions
+        lengths = np.cumsum([len(m.time) for m in motions])[:-1]
+
+        def columns(forces: FloatArray) -> FloatArray:
+            return self._filtered(np.split(-forces, lengths))
+
+        variables = {
+            name: np.concatenate([getattr(m, name) for m in motions]) for name in ("position", "velocity", "acceleration")
+        }
+        variables["time"] = np.concatenate([m.time - start[m.recording] for m in motions])
+        variables["force"] = np.concatenate(self._smooth_forces)
+        return Sites(("axis_force",), variables, smoothing, columns)
 
     def _contributions(
         self, effect: JointTorqueEffect, parameters: dict[str, float] | Shape

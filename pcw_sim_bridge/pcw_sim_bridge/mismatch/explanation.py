@@ -24,7 +24,7 @@ import numpy as np
 from scipy import stats
 
 from .evidence_selection import EffectSearch, Progress, Selection, SelectionSettings
-from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest
+from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
 from .regression_problem import FloatArray, RegressionProblem, Term
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
@@ -142,16 +142,9 @@ def explain(
 ) -> Explanation:
     """Search, test what is left, refine; see the module."""
     search = EffectSearch(problem, rng, settings, progress)
-    selection = _with_whole_numbers(search, search.run())
-    result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
-    withdrawn: list[tuple[str, str]] = []
-    while result.vetoed:
-        instance, variable = result.vetoed[0]
-        withdrawn.append((search.label(instance), variable))
-        progress(f"withdrawn: {search.label(instance)}, the residual depends on {variable}")
-        kept = [other for other in selection.fit.instances if other != instance]
-        selection = search.conclude(kept, selection.threshold)
-        result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
+    judgement = judge(search, _with_whole_numbers(search, search.run()))
+    search, selection, result = judgement.search, judgement.selection, judgement.result
+    problem = search.problem
     suspect, undecided, remarks = None, {}, ()
     refined = _refined(search, selection, result)
     if refined is not None:
@@ -161,11 +154,17 @@ def explain(
         if not finished.vetoed and not {left.variable for left in finished.leftovers} & set(arguments):
             progress(f"refined: {search.label(refined.instances[refined.position])}, {refined.gain:.1f} nats")
             remarks = _remarks(search, selection, refined)
-            selection, result, undecided = better, finished, refined.undecided
+            laws = tuple(left for left in result.leftovers if left.law is not None)
+            result = dataclasses.replace(finished, leftovers=(*laws, *finished.leftovers))
+            selection, undecided = better, refined.undecided
         else:
             suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
             progress(f"not adopted: {suspect.describe()}")
-    named = named_terms(search, selection)
+    named = tuple(
+        dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
+        for entry in named_terms(search, selection)
+        if not is_unknown(problem, entry.instance)
+    )
     if refined is not None:
         rival = problem.terms[refined.instances[refined.position].term].effect
         if suspect is not None:
@@ -176,7 +175,7 @@ def explain(
         selection=selection,
         named=named,
         leftovers=result.leftovers,
-        withdrawn=tuple(withdrawn),
+        withdrawn=judgement.withdrawn,
         refinement=suspect,
         remarks=remarks,
         floor=result.floor,

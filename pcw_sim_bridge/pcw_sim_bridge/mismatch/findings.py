@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from .generated_effect import GeneratedEffect
 from .regression_problem import FloatArray
 
 FORMAT = "pcw_mismatch/1"
@@ -78,12 +79,29 @@ class EffectFinding:
 
 @dataclasses.dataclass(frozen=True)
 class UnknownFinding:
-    """A leftover that no effect of the library explains."""
+    """A leftover that no effect of the library explains.
+
+    Attributes:
+        depends_on: variables, the leading one first.
+        effect: a file by which simulators can use it, in folder `effects` of the report; None where there is none.
+        without_effect: why there is none; "" where nothing acts like a torque or force.
+    """
 
     channel: str
     depends_on: tuple[str, ...]
     expression: str | None
     share_explained: float
+    effect: GeneratedEffect | None = None
+    without_effect: str = ""
+
+    def effect_entry(self) -> dict[str, Any] | None:
+        """Return what report.json says of the file."""
+        if self.effect is None:
+            return None
+        return {
+            "name": self.effect.name, "target": list(self.effect.target), "parameters": dict(self.effect.parameters),
+            "file": f"effects/{self.effect.name}.py",
+        }  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,6 +224,8 @@ class Findings:
                     "depends_on": list(leftover.depends_on),
                     "expression": leftover.expression,
                     "share_explained": leftover.share_explained,
+                    "effect": leftover.effect_entry(),
+                    "without_effect": leftover.without_effect,
                 }
                 for leftover in self.unknown
             ],

@@ -1,5 +1,9 @@
 """Is anything left, and what does it depend on? Asked before a name is given out.
 
+First a law outside the library is looked for where torques and forces act (`law_search`). It stays in the joint fit, as a
+closed form where one does as well as a curve, and takes with it the names that it makes redundant. Then, for whatever no
+such law can be:
+
 After the joint fit every channel's residual is offered a smooth function of one measured variable at a time (piecewise
 linear, or a Fourier series for an angle). The function is fitted together with the effects and the tolerances, so that
 it cannot live on what they explain already, and it counts only as far as it lowers the error of held-out blocks. A
@@ -10,14 +14,17 @@ withdrawn and the dependence reported instead.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from .evidence_selection import EffectSearch
+from .evidence_selection import EffectSearch, Selection
+from .law_search import FoundLaw, LawSearch
+from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import FloatArray, IntArray, RegressionProblem
-from .whitened_regression import Instance, WhitenedRegression
+from .unknown_law import UNKNOWN, Law
+from .whitened_regression import Fit, Instance, WhitenedRegression
 
 HAT_KNOTS = 9
 HARMONICS = 3
@@ -27,6 +34,11 @@ SMALLEST_GAIN = 10.0  # nats, on top of the threshold of the names
 # It must also reach this part of the measured signal. Below lie details that no description of a real machine holds (the
 # lean on its springs, the ripple of a filter); a tool that reports them on every healthy robot says nothing.
 SMALLEST_PART = 0.02
+LARGEST_LAWS = 2
+# So many variables of a channel are looked at closely, after a look at so many samples.
+MOST_PROMISING, PROMISING_SAMPLES = 4, 500
+# A closed form may leave this part more of what a curve explains.
+CLOSED_PART = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +49,10 @@ class Leftover:
         share: part of the channel's remaining mean square that the dependence explains on held-out blocks.
         gain: nats on held-out blocks.
         curve: the function, as (variable (N,), contribution (N,)) for the report.
+        depends_on: all variables, the leading one first.
+        expression: closed form of the torque or force; None where there is only a curve.
+        law: what acts where; None for a dependence of a channel that is no torque or force.
+        weights: of the law's basis (K,).
     """
 
     channel: str
@@ -44,6 +60,10 @@ class Leftover:
     share: float
     gain: float
     curve: tuple[FloatArray, FloatArray]
+    depends_on: tuple[str, ...] = ()
+    expression: str | None = None
+    law: Law | None = None
+    weights: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +79,175 @@ class OpenSetResult:
     leftovers: tuple[Leftover, ...]
     vetoed: tuple[tuple[Instance, str], ...]
     floor: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class Judgement:
+    """What remains of a selection when physics outside the library has been looked for.
+
+    Attributes:
+        search, selection: with laws that were found as further terms, called `UNKNOWN`.
+        result: what is left, laws first.
+        withdrawn: names that something left explains better: (label, variable).
+        beliefs: what is left of the probability of names, by term, that a law not sure enough to be told would withdraw.
+    """
+
+    search: EffectSearch
+    selection: Selection
+    result: OpenSetResult
+    withdrawn: tuple[tuple[str, str], ...]
+    beliefs: Mapping[int, float]
+
+
+def judge(search: EffectSearch, selection: Selection) -> Judgement:
+    """Look for laws outside the library and for dependences of channels; withdraw the names that they make redundant."""
+    withdrawn: list[tuple[str, str]] = []
+    found: list[tuple[Law, FoundLaw]] = []
+    beliefs: dict[int, float] = {}
+    result = None
+    for _ in range(LARGEST_LAWS if search.problem.sites is not None else 0):
+        law = LawSearch(search, selection).run()
+        if law is None:
+            break
+        if not law.counts:
+            beliefs = {i.term: law.belief for i in law.withdrawn}
+            break
+        before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
+        search, selection, final = _adopted(search, selection, law)
+        after = {i.term for i in selection.fit.instances}
+        withdrawn += [(search.label(i), final.depends_on[0]) for i in before if i.term not in after]
+        found.append((final, law))
+        result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
+        if not result.leftovers:
+            break
+    result = result or OpenSetTest(search, selection.fit.instances).run(selection.threshold)
+    while vetoed := [v for v in result.vetoed if not is_unknown(search.problem, v[0])]:
+        instance, variable = vetoed[0]
+        withdrawn.append((search.label(instance), variable))
+        kept = [other for other in selection.fit.instances if other != instance]
+        selection = search.conclude(kept, selection.threshold)
+        result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
+    for label, variable in withdrawn:
+        search.progress(f"withdrawn: {label}, the residual depends on {variable}")
+    laws = [_law_leftover(search, selection, law, how) for law, how in found]
+    return Judgement(
+        search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs
+    )
+
+
+def is_unknown(problem: RegressionProblem, instance: Instance) -> bool:
+    """Whether an instance is a law outside the library."""
+    return problem.terms[instance.term].effect == UNKNOWN
+
+
+def names_only(problem: RegressionProblem, fit: Fit) -> Fit:
+    """Return a joint fit without the laws outside the library: what a patched description holds."""
+    keep = np.ones(len(fit.mean), dtype=bool)
+    position = len(problem.nuisances)
+    for instance in fit.instances:
+        keep[position : position + len(instance.active)] = not is_unknown(problem, instance)
+        position += len(instance.active)
+    instances = tuple(i for i in fit.instances if not is_unknown(problem, i))
+    return dataclasses.replace(fit, instances=instances, mean=fit.mean[keep], covariance=fit.covariance[np.ix_(keep, keep)])
+
+
+def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tuple[EffectSearch, Selection, Law]:
+    """Put a law into the joint fit: as a closed form if it does as well as the curve."""
+    curve = _with_law(search, selection, found.law, found.names)
+    weights, covariance = _weights_of(*curve, found.law)
+    form = closed_form(found.law.basis, weights, covariance)
+    if form is None:
+        return *curve, found.law
+    law = dataclasses.replace(found.law, basis=form)
+    closed = _with_law(search, selection, law, found.names)
+    valid = search.problem.valid
+    residuals = [s.residual_of(c.fit.instances) for s, c in (curve, closed)]
+    residuals.append(search.residual_of(found.names))
+    deviation = np.array([robust_deviation(residuals[0][valid[:, c], c]) for c in range(valid.shape[1])])
+    sizes = [float(np.sum(np.where(valid, residual / deviation, 0.0) ** 2)) for residual in residuals]
+    if sizes[1] - sizes[0] < CLOSED_PART * (sizes[2] - sizes[0]):
+        law = _without_what_names_hold(*closed, law, form)
+        search, selection = _with_law(search, selection, law, found.names)
+        return search, _without_redundant(search, selection), law
+    if found.law.basis.kind == "periodic":
+        law = dataclasses.replace(found.law, basis=fourier(found.law.basis))
+        return *_with_law(search, selection, law, found.names), law
+    return *curve, found.law
+
+
+def _without_what_names_hold(search: EffectSearch, selection: Selection, law: Law, form: ClosedForm) -> Law:
+    """Return the law without those of its functions that the names beside it do without."""
+    names, own = selection.fit.instances[:-1], selection.fit.instances[-1]
+    active = own.active
+    while len(active) > 1 and names:
+        best = selection.regression.fit((*names, dataclasses.replace(own, active=active))).log_evidence
+        trials = [tuple(k for k in active if k != left) for left in active]
+        evidence = [
+            selection.regression.fit((*names, dataclasses.replace(own, active=trial))).log_evidence for trial in trials
+        ]
+        index = int(np.argmax(evidence))
+        if best - evidence[index] > selection.threshold:
+            break
+        active = trials[index]
+    return dataclasses.replace(law, basis=dataclasses.replace(form, atoms=tuple(form.atoms[k] for k in active)))
+
+
+def _with_law(
+    search: EffectSearch, selection: Selection, law: Law, names: tuple[Instance, ...]
+) -> tuple[EffectSearch, Selection]:
+    """Fit names and law jointly."""
+    problem = search.problem.with_terms([law.term(search.problem)])
+    wider = EffectSearch(problem, search.rng, search.settings, search.progress)
+    wider.noise_gain, wider.ladder = search.noise_gain, search.ladder
+    instance = Instance(len(problem.terms) - 1, (), tuple(range(len(problem.terms[-1].parameters))))
+    return wider, wider.conclude((*names, instance), selection.threshold)
+
+
+def _without_redundant(search: EffectSearch, selection: Selection) -> Selection:
+    """Withdraw the names, the law being the last instance, that cost less than the threshold."""
+    while len(selection.fit.instances) > 1 and min(selection.losses[:-1]) < selection.threshold:
+        weakest = int(np.argmin(selection.losses[:-1]))
+        kept = [i for k, i in enumerate(selection.fit.instances) if k != weakest]
+        selection = search.conclude(kept, selection.threshold)
+    return selection
+
+
+def _weights_of(search: EffectSearch, selection: Selection, law: Law) -> tuple[FloatArray, FloatArray]:
+    """Weights of a law's basis in the joint fit, with their covariance."""
+    position = len(search.problem.nuisances)
+    for instance in selection.fit.instances:
+        count = len(instance.active)
+        term = search.problem.terms[instance.term]
+        if term.effect == UNKNOWN and term.target == law.sites and term.arguments == law.depends_on:
+            rows = slice(position, position + count)
+            return selection.fit.mean[rows], selection.fit.covariance[rows, rows]
+        position += count
+    raise AssertionError("the law is in the fit")
+
+
+def _law_leftover(search: EffectSearch, selection: Selection, law: Law, found: FoundLaw) -> Leftover:
+    weights, _ = _weights_of(search, selection, law)
+    knots = law.basis.knots[0]
+    grid = np.linspace(knots[0], knots[-1], 61)
+    if len(law.basis.knots) == 1:
+        curve = law.basis.functions([grid]) @ weights
+    else:
+        curve = law.basis.functions([grid, np.full_like(grid, float(np.median(law.basis.knots[1])))]) @ weights
+    return Leftover(
+        _channel_of(search, law), law.depends_on[0], found.share, found.held_out, (grid, curve), law.depends_on,
+        written(law, weights), law, weights,
+    )  # fmt: skip
+
+
+def _channel_of(search: EffectSearch, law: Law) -> str:
+    """Name of the site; of all drives or steerings, or of a force along a direction, the channel that it moves most."""
+    if len(law.sites) == 1 or (len(law.sites) == 2 and not law.sites[0].startswith("chassis")):
+        return law.sites[0]
+    problem = search.problem
+    columns = problem.columns(len(problem.terms) - 1, ())
+    moved = np.sqrt(np.mean(np.where(problem.valid[:, :, None], columns, 0.0) ** 2, axis=(0, 2)))
+    signal = np.sqrt(np.mean(np.where(problem.valid, problem.measured, 0.0) ** 2, axis=0))
+    return problem.channels[int(np.argmax(moved / np.maximum(signal, 1e-300)))].name
 
 
 def smooth_basis(values: FloatArray, periodic: bool) -> tuple[FloatArray, FloatArray]:
@@ -141,9 +330,8 @@ class OpenSetTest:
         if not valid.any():
             return None
         signal = float(np.std(self.problem.measured[valid, channel]))
-        for (c, name), (functions, knots) in self.bases.items():
-            if c != channel:
-                continue
+        for name in self._promising(channel):
+            functions, knots = self.bases[channel, name]
             gain, share, curve = self._dependence(channel, name, functions, knots, instances)
             size = np.sqrt(share) * float(np.sqrt(np.mean(self.residual[valid, channel] ** 2)))
             passes = (
@@ -152,6 +340,23 @@ class OpenSetTest:
             if passes and (best is None or gain > best.gain):
                 best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
         return best
+
+    def _promising(self, channel: int) -> list[str]:
+        """Variables whose functions take a part of the residual as it is, the largest parts first, and few of them."""
+        rows = np.flatnonzero(self.problem.valid[:, channel])
+        rows = rows[:: max(1, len(rows) // PROMISING_SAMPLES)]
+        left = self.residual[rows, channel]
+        total = max(float(left @ left), 1e-300)
+        parts = {}
+        for (c, name), (functions, _) in self.bases.items():
+            if c == channel:
+                columns = np.column_stack([functions[rows], np.ones(len(rows))])
+                moment = columns.T @ left
+                gram = columns.T @ columns
+                gram[np.diag_indices_from(gram)] += 1e-9 * np.trace(gram)
+                parts[name] = float(moment @ np.linalg.solve(gram, moment)) / total
+        ordered = sorted(parts, key=lambda name: -parts[name])[:MOST_PROMISING]
+        return [name for name in ordered if parts[name] > 0.5 * SMALLEST_SHARE]
 
     def _dependence(
         self, channel: int, name: str, functions: FloatArray, knots: FloatArray, instances: Sequence[Instance]

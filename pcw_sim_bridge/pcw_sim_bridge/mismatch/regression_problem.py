@@ -13,7 +13,7 @@ problem; the engine knows nothing of axes and robots.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -137,6 +137,25 @@ class Term:
 
 
 @dataclasses.dataclass(frozen=True)
+class Sites:
+    """Where a torque or force may act that no effect of the library describes.
+
+    Attributes:
+        names: of the sites, as channels are named: `drive_torque/<caster>`, `steer_torque/<caster>`, `chassis_force/x|y` and
+            `chassis_torque/z` in base_link, or `axis_force`.
+        variables: what it may depend on: name -> (N,), at the rate at which the model is evaluated; names as those of
+            `RegressionProblem.variables`.
+        smoothing: speed over which the sign of a joint's speed reverses, as in the library's frictions [rad/s].
+        columns: torques and forces (N, len(names), K) -> what they add to the residual (T, C, K).
+    """
+
+    names: tuple[str, ...]
+    variables: Mapping[str, FloatArray]
+    smoothing: float
+    columns: Callable[[FloatArray], FloatArray]
+
+
+@dataclasses.dataclass(frozen=True)
 class RegressionProblem:
     """Residuals and what may explain them, all on one regular time grid per segment.
 
@@ -151,6 +170,7 @@ class RegressionProblem:
         misjudged: standard deviation of what the model itself misjudges in each sample, besides noise (T, C); None: of none.
         scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
             known no better, and an effect that is no larger is not told from it.
+        sites: where an unknown torque or force may act; None where nothing measured would show it.
     """
 
     channels: tuple[Channel, ...]
@@ -166,6 +186,7 @@ class RegressionProblem:
     variables: Mapping[str, FloatArray]
     misjudged: FloatArray | None = None
     scale_deviation: float = 0.0
+    sites: Sites | None = None
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -193,6 +214,12 @@ class RegressionProblem:
         if (term, shape) not in self._remembered:
             self._remembered[term, shape] = self.terms[term].columns(dict(shape))
         return self._remembered[term, shape]
+
+    def with_terms(self, terms: Sequence[Term]) -> RegressionProblem:
+        """Return the problem with further terms after its own; columns that were computed are kept."""
+        wider = dataclasses.replace(self, terms=(*self.terms, *terms))
+        wider._remembered.update(self._remembered)
+        return wider
 
     def nuisance_columns(self) -> FloatArray:
         """Nuisance columns side by side, (T, C, K)."""

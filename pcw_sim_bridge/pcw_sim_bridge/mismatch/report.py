@@ -25,7 +25,7 @@ from .errors import MismatchError
 from .findings import VERDICTS, Findings, ParameterFinding, RetunedFinding
 from .report_figures import SUPERSCRIPTS, TraceFigures, draw_traces, pretty_unit, time_origin
 
-HTML, JSON, PATCHED, FIGURES = "report.html", "report.json", "robot_patched.yaml", "figures"
+HTML, JSON, PATCHED, FIGURES, EFFECTS = "report.html", "report.json", "robot_patched.yaml", "figures", "effects"
 TEMPLATE = "report.html.j2"
 BEYOND_TOLERANCE = 3.0  # tolerances; a number that moved further is not healthy re-tuning
 # Where report.json may say null instead of a number that does not exist (NaN); anywhere else NaN is an error.
@@ -101,7 +101,7 @@ def _check_output(out: Path, force: bool) -> None:
 def _is_report(folder: Path) -> bool:
     """Whether a folder holds a report and nothing else, so that replacing it loses nothing of value."""
     names = {entry.name for entry in folder.iterdir()}
-    if JSON not in names or not names <= {HTML, JSON, PATCHED, FIGURES}:
+    if JSON not in names or not names <= {HTML, JSON, PATCHED, FIGURES, EFFECTS}:
         return False
     figures = folder / FIGURES
     if not figures.exists():
@@ -169,6 +169,10 @@ def write_report(findings: Findings, patched: Mapping[str, Any] | None, out: Pat
             _write(folder / JSON, content)
             if patched_text is not None:
                 _write(folder / PATCHED, patched_text)
+            for leftover in findings.unknown:
+                if leftover.effect is not None:
+                    (folder / EFFECTS).mkdir(exist_ok=True)
+                    _write(folder / EFFECTS / f"{leftover.effect.name}.py", leftover.effect.source)
             figures = draw_traces(findings)
             (folder / FIGURES).mkdir()
             for traces in figures:

@@ -6,22 +6,23 @@ nuisance column, and every effect a candidate; both by differences of the whole 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pcw_description.effects.drive_coulomb_friction import SMOOTHING_SPEED
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
 
 from ..plants.true_robot import as_it_really_is
 from .channel_differences import ChannelDifferences
 from .errors import MismatchError
-from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem
+from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites
 from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
 from .robot_nuisances import robot_nuisances
 from .robot_terms import robot_terms
-from .rolling_model import ChannelLayout, ModelNumbers, twists
+from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, twists
 from .signal_filter import SignalFilter
 
 # Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
@@ -82,6 +83,7 @@ class RobotProblemBuilder:
             with_terms: False leaves out candidate effects and variables: residual and tolerances alone are many times cheaper.
         """
         differences = ChannelDifferences(self.model, self.motions, self.filters)
+        along = self._along_motions(differences) if with_terms else {}
         stamps = [f.decimate(m.time) for f, m in zip(self.filters, self.motions, strict=True)]
         numbers = [m.recording for m in self.motions]
         return RegressionProblem(
@@ -95,9 +97,10 @@ class RobotProblemBuilder:
             valid=self._valid(differences),
             nuisances=tuple(robot_nuisances(self.robot, differences)),
             terms=tuple(robot_terms(self.robot, differences)) if with_terms else (),
-            variables=self._variables(differences) if with_terms else {},
+            variables=self._variables(along),
             misjudged=self._misjudged(differences),
             scale_deviation=self._scale_deviation(),
+            sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
         )
 
     def _scale_deviation(self) -> float:
@@ -128,14 +131,14 @@ class RobotProblemBuilder:
             pieces.append((bad[:, None] | ~known).astype(float))
         return differences.filtered(pieces) < 0.1
 
-    def _variables(self, differences: ChannelDifferences) -> dict[str, FloatArray]:
-        """What a leftover may depend on, each (T,)."""
+    def _along_motions(self, differences: ChannelDifferences) -> dict[str, list[FloatArray]]:
+        """What a leftover may depend on, one array per motion."""
         found: dict[str, list[FloatArray]] = {}
-        for filter_, motion, normal in zip(self.filters, self.motions, differences.normal, strict=True):
+        for motion, normal in zip(self.motions, differences.normal, strict=True):
             twist, _ = twists(self.numbers, motion.position[:, :, STEER], motion.velocity)
-            found.setdefault("time", []).append(filter_.decimate(motion.time))
-            signals = {"speed": np.hypot(twist[:, 0], twist[:, 1]), "x": motion.pose[:, 0], "y": motion.pose[:, 1]}
+            signals = {"time": motion.time, "speed": np.hypot(twist[:, 0], twist[:, 1])}
             signals |= {name: twist[:, k] for k, name in enumerate(("v_x", "v_y", "omega"))}
+            signals |= {name: motion.pose[:, k] for k, name in enumerate(("x", "y", "yaw"))}
             for i, caster in enumerate(self.robot.caster_names):
                 signals[f"steer_angle/{caster}"] = motion.position[:, i, STEER]
                 signals[f"drive_angle/{caster}"] = motion.position[:, i, DRIVE]
@@ -144,5 +147,32 @@ class RobotProblemBuilder:
                     signals[f"{axis_name}_velocity/{caster}"] = motion.velocity[:, i, axis]
                     signals[f"{axis_name}_torque/{caster}"] = motion.torque[:, i, axis]
             for name, values in signals.items():
-                found.setdefault(name, []).append(filter_.apply(np.ascontiguousarray(values)))
-        return {name: np.concatenate(parts) for name, parts in found.items()}
+                found.setdefault(name, []).append(np.ascontiguousarray(values))
+        return found
+
+    def _variables(self, along: Mapping[str, Sequence[FloatArray]]) -> dict[str, FloatArray]:
+        """What a leftover may depend on, each (T,)."""
+        found = {}
+        for name, parts in along.items():
+            pieces = zip(self.filters, parts, strict=True)
+            found[name] = np.concatenate([f.decimate(p) if name == "time" else f.apply(p) for f, p in pieces])
+        return found
+
+    def _sites(self, differences: ChannelDifferences, along: Mapping[str, Sequence[FloatArray]]) -> Sites:
+        """Where an unknown torque or force may act: every joint, and forces and a moment on the chassis."""
+        n = self.robot.n
+        joints = tuple(f"{axis}_torque/{caster}" for caster in self.robot.caster_names for axis in AXIS_NAMES)
+        borders = np.cumsum([len(motion.time) for motion in self.motions])[:-1]
+
+        def columns(forces: FloatArray) -> FloatArray:
+            wrench = np.zeros((len(forces), len(self.channels()), forces.shape[2]))
+            wrench[:, : len(WRENCH)] = -forces[:, 2 * n :]
+            found = differences.filtered(np.split(wrench, borders))
+            torques = forces[:, : 2 * n].reshape(len(forces), n, 2, -1)
+            for k in range(torques.shape[3]):
+                if torques[..., k].any():
+                    found[:, :, k] += differences.of_torque(np.split(torques[..., k], borders))
+            return found
+
+        variables = {name: np.concatenate(parts) for name, parts in along.items()}
+        return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)

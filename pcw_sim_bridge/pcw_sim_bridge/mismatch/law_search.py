@@ -1,0 +1,310 @@
+"""Finds a law outside the library that explains a recording better than the names do, before the names are given out.
+
+All hypotheses of `unknown_law` are screened on top of the named effects and in place of them. Screening takes the function
+of a slow argument as constant over the length of the channels' filter, so that one filtered column per site and factor
+serves all functions of all arguments. The best few are then fitted with exact columns, jointly with names and tolerances.
+
+A law counts if it beats the names, refined as far as they can be, by evidence and on held-out blocks, and moves the
+prediction by a part that matters. A name that it makes redundant is withdrawn, unless the name alone does most of what
+the law does: friction that varies by a tenth with the steering angle is friction and a leftover.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from .evidence_selection import EffectSearch, Selection
+from .noise_model import huber_weights, robust_deviation
+from .regression_problem import FloatArray, RegressionProblem
+from .unknown_law import Factor, Law, Place, combined, factor_values, hypotheses
+from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
+
+# Nats on top of the threshold of the names: there are more hypotheses, and they come from no list of known physics.
+LAW_MARGIN = 15.0
+# Logarithm of their number: what the best of them gains for having been chosen.
+HYPOTHESES_COST = 8.0
+# Samples of a channel count as so many fewer in the screening, where the colour of the noise is not looked at.
+SCREENING_CORRELATION = 5.0
+# At most so many samples are looked at in the screening.
+SCREENED_SAMPLES = 400
+FINALISTS = 4
+FOLDS = 5
+# A law must move some channel by this part of the rms that it leaves there, and by this part of the measured side.
+SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
+# A name stays beside a law if without the law it leaves less than this part of what both explain together.
+KEPT_PART = 0.02
+MENDING_PART = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundLaw:
+    """A law that counts.
+
+    Attributes:
+        gain: nats over the names; held_out: the same on held-out blocks.
+        share: part of what the remaining names leave that the law explains on held-out blocks.
+        names: instances that stay.
+        withdrawn: instances whose name is withdrawn.
+        counts: whether it is sure enough to be told. If not, it is a doubt about the names that it would withdraw.
+        alike: whether these names do most of what it does.
+    """
+
+    law: Law
+    gain: float
+    held_out: float
+    share: float
+    names: tuple[Instance, ...]
+    withdrawn: tuple[Instance, ...]
+    counts: bool
+    alike: bool
+
+    @property
+    def belief(self) -> float:
+        """What is left of the probability of the names that it would withdraw.
+
+        Half of it where name and law explain nearly the same: then details of the model decide between them.
+        """
+        odds = math.exp(min(min(self.gain, self.held_out) - HYPOTHESES_COST, 50.0))
+        return max(1.0 / (1.0 + odds), 0.5 if self.alike else 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Trial:
+    """A law fitted with exact columns beside the names that it leaves standing."""
+
+    law: Law
+    search: EffectSearch
+    names: tuple[Instance, ...]
+    instance: Instance
+
+    @property
+    def instances(self) -> tuple[Instance, ...]:
+        return (*self.names, self.instance)
+
+
+class LawSearch:
+    """Looks for one law beside or instead of the named effects of a selection."""
+
+    def __init__(self, search: EffectSearch, selection: Selection) -> None:
+        """Take a finished search; the problem must have sites."""
+        self.search, self.problem = search, search.problem
+        self.threshold = selection.threshold + LAW_MARGIN
+        self.plain = selection.fit.instances
+        terms = self.problem.terms
+        # What the library can refine is not outside of it.
+        self.names = tuple(
+            dataclasses.replace(i, active=tuple(range(len(terms[i.term].parameters)))) for i in self.plain
+        )
+
+    def run(self) -> FoundLaw | None:
+        """Return the best law, whether it counts or not; None if no law looks better than nothing."""
+        trials = [self._trial(law) for law in self._screened()]
+        if not trials:
+            return None
+        # All are judged under the noise that the best of them leaves: under that of a worse one it is "slow noise".
+        residual = self._left_by(max(trials, key=self._plain_evidence))
+        trials = [self._pruned(residual, trial) for trial in trials]
+        best = max(trials, key=lambda t: t.search.whiten_at(residual).fit(t.instances).log_evidence)
+        return self._judged(best)
+
+    # -- screening ----------------------------------------------------------------------------------------------
+
+    def _screened(self) -> list[Law]:
+        """The most promising laws: on top of the names, and with none."""
+        assert self.problem.sites is not None
+        laws = hypotheses(self.problem.sites)
+        chosen: list[Law] = []
+        for gains in _Screen(self.search, laws).gains(list(dict.fromkeys([self.names, ()]))):
+            order = np.argsort(-gains)
+            chosen += [laws[k] for k in order[:FINALISTS] if gains[k] > 0.0]
+        return list(dict.fromkeys(chosen))
+
+    # -- finalists ----------------------------------------------------------------------------------------------
+
+    def _trial(self, law: Law) -> _Trial:
+        term = law.term(self.problem)
+        problem = self.problem.with_terms([term])
+        settings = dataclasses.replace(self.search.settings, blocks=FOLDS * self.search.settings.blocks)
+        search = EffectSearch(problem, self.search.rng, settings)
+        everything = tuple(range(len(term.parameters)))
+        return _Trial(law, search, self.names, Instance(len(problem.terms) - 1, (), everything))
+
+    def _left_by(self, trial: _Trial) -> FloatArray:
+        return trial.search.residual_of(trial.instances)
+
+    def _plain_evidence(self, trial: _Trial) -> float:
+        return trial.search.whiten_at(self.problem.residual, white=True).fit(trial.instances).log_evidence
+
+    def _pruned(self, residual: FloatArray, trial: _Trial) -> _Trial:
+        """Drop the names that the law makes redundant; not those that depend on all that the law depends on."""
+        under = trial.search.whiten_at(residual)
+        names = trial.names
+        while names:
+            fit = under.fit((*names, trial.instance))
+            margins = []
+            for index, instance in enumerate(names):
+                others = (*names[:index], *names[index + 1 :])
+                without = under.fit((*others, trial.instance)).log_evidence
+                allowed = self.threshold - LAW_MARGIN
+                if _same_place(trial.law, self.problem.terms[instance.term].target):
+                    # There a name may serve to mend the shape of the law.
+                    allowed = max(allowed, MENDING_PART * (without - under.fit(others).log_evidence))
+                protected = set(trial.law.depends_on) <= set(self.problem.terms[instance.term].arguments)
+                margins.append(np.inf if protected else fit.log_evidence - without - allowed)
+            index = int(np.argmin(margins))
+            if margins[index] >= 0.0:
+                break
+            names = names[:index] + names[index + 1 :]
+        return dataclasses.replace(trial, names=names)
+
+    def _judged(self, best: _Trial) -> FoundLaw | None:
+        problem = best.search.problem
+        regression = best.search.whiten_at(self._left_by(best))
+        with_law, without = regression.fit(best.instances), regression.fit(self.names)
+        gain = with_law.log_evidence - without.log_evidence
+        scores = [_held_out_error(regression, i) for i in (best.instances, self.names, best.names)]
+        held_out = 0.5 * (scores[1] - scores[0])
+        self.search.progress(
+            f"outside the library: {' and '.join(best.law.sites)} by {', '.join(best.law.depends_on)}:"
+            f" {gain:.1f} nats, held out {held_out:.1f}"
+        )
+        counts = min(gain, held_out) >= self.threshold and self._matters(problem, with_law, without)
+        both = max(scores[2] - scores[0], 1e-300)
+        dropped = tuple(i for i in self.names if i not in best.names)
+        names, withdrawn = best.names, dropped
+        alike = bool(dropped) and (scores[1] - scores[0]) / both < KEPT_PART
+        if alike and counts:
+            names, withdrawn = self.names, ()
+        plain = {i.term: i for i in self.plain}
+        return FoundLaw(
+            best.law, gain, held_out, min(both / max(scores[2], 1e-300), 1.0),
+            tuple(plain[i.term] if i.term in plain else i for i in names),
+            tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
+        )
+
+    def _matters(self, problem: RegressionProblem, with_law: Fit, without: Fit) -> bool:
+        """Whether the law moves the prediction of some channel by more than details and misjudgements of the model."""
+        after = predicted(problem, with_law)
+        left = problem.residual - after
+        change = after - predicted(problem, without)
+        for channel in range(change.shape[1]):
+            valid = problem.valid[:, channel]
+            if not valid.any():
+                continue
+            size = float(np.sqrt(np.mean(change[valid, channel] ** 2)))
+            signal = float(np.sqrt(np.mean(problem.measured[valid, channel] ** 2)))
+            part = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
+            if size > max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), part):
+                return True
+        return False
+
+
+def _same_place(law: Law, target: Sequence[str]) -> bool:
+    """Whether a law acts where an effect does: at one of its casters, on the chassis, at the axis."""
+    places = {site.partition("/")[2] if "/" in site and not site.startswith("chassis") else site for site in law.sites}
+    places |= {"chassis" for site in law.sites if site.startswith("chassis")}
+    places |= {"axis" for site in law.sites if site == "axis_force"}
+    return bool(places & set(target))
+
+
+def _held_out_error(regression: WhitenedRegression, instances: Sequence[Instance]) -> float:
+    """Squared whitened error of every fold, predicted from the others.
+
+    A fold is every so many short blocks, not one long stretch: a place or a moment that was visited once cannot be
+    predicted from anywhere else.
+    """
+    grams = regression.grams(instances)
+    labels = np.arange(len(grams)) % FOLDS
+    scale = regression.deviations(instances)
+    total, error = grams.sum(axis=0), 0.0
+    for fold in range(FOLDS):
+        own = grams[labels == fold].sum(axis=0)
+        known = total - own
+        precision = known[:-1, :-1] * np.outer(scale, scale) + np.eye(len(scale))
+        mean = scale * np.linalg.solve(precision, scale * known[:-1, -1])
+        extended = np.append(-mean, 1.0)
+        error += float(extended @ own @ extended)
+    return error
+
+
+class _Screen:
+    """Scores of many laws at once, by weighted least squares of the channels that they can move."""
+
+    def __init__(self, search: EffectSearch, laws: Sequence[Law]) -> None:
+        assert search.problem.sites is not None
+        self.search, self.problem, self.sites, self.laws = search, search.problem, search.problem.sites, laws
+        self.step = max(1, round(len(self.problem.time) / SCREENED_SAMPLES))
+        self._bases = self._filtered_bases()
+        self._moved = np.flatnonzero(np.any([np.abs(b).max(axis=0) > 0.0 for b in self._bases.values()], axis=0))
+        self._variables = {name: values[:: self.step] for name, values in self.problem.variables.items()}
+        self._functions: dict[tuple[object, object], FloatArray] = {}
+
+    def gains(self, sets: Sequence[tuple[Instance, ...]]) -> FloatArray:
+        """Return roughly the nats that each law gains beside each set (sets, laws), penalised for its number of functions.
+
+        Without regard to the colour of the noise, and on every few samples only.
+        """
+        beside = [self._beside(instances) for instances in sets]
+        gains = np.empty((len(sets), len(self.laws)))
+        bases = {key: np.ascontiguousarray(base[:: self.step, self._moved]) for key, base in self._bases.items()}
+        for index, law in enumerate(self.laws):
+            columns: FloatArray = sum(  # type: ignore[assignment]
+                p.weight * bases[p.site, p.factor][:, :, None] * self._of(law, p)[:, None, :] for p in law.places
+            )
+            for row, (weight, known, target, total, rows) in enumerate(beside):
+                flat = (columns * weight[:, :, None]).reshape(-1, columns.shape[2])
+                cross = known.T @ flat
+                plain = flat.T @ flat
+                gram = plain - cross.T @ cross
+                # A function that is nowhere at work, or that the tolerances make, must not be blown up.
+                gram[np.diag_indices_from(gram)] += 1e-6 * np.diag(plain) + 1e-12 * np.trace(plain) + 1e-300
+                moment = flat.T @ target
+                explained = min(float(moment @ np.linalg.solve(gram, moment)), 0.999999 * total)
+                gains[row, index] = -0.5 * rows * np.log1p(-explained / total) - 0.5 * flat.shape[1] * np.log(rows)
+        return gains
+
+    def _beside(self, instances: tuple[Instance, ...]) -> tuple[FloatArray, FloatArray, FloatArray, float, float]:
+        """Weights, what tolerances and set span, what they leave, its square, and independent rows, for one set."""
+        problem, moved, step = self.problem, self._moved, self.step
+        residual = self.search.residual_of(instances)
+        valid = problem.valid[::step, moved]
+        deviation = np.array([robust_deviation(residual[problem.valid[:, c], c]) for c in moved])
+        weight = np.where(valid, np.sqrt(huber_weights(residual[::step, moved] / deviation)) / deviation, 0.0)
+        parts = [problem.nuisance_columns() * problem.nuisance_deviations()]
+        for instance in instances:
+            parameters = problem.terms[instance.term].parameters
+            scale = np.array([parameters[k].deviation for k in instance.active])
+            parts.append(problem.columns(instance.term, instance.shape)[..., list(instance.active)] * scale)
+        design = np.concatenate(parts, axis=2)[::step, moved]
+        design = (design * weight[:, :, None]).reshape(weight.size, -1)
+        # The tolerances come in as further rows.
+        known, _ = np.linalg.qr(np.concatenate([design, np.eye(design.shape[1])]))
+        known = known[: len(design)]
+        target = (problem.residual[::step, moved] * weight).ravel()
+        projection = known.T @ target
+        total = float(target @ target - projection @ projection)
+        return weight, known, target - known @ projection, total, float(valid.sum()) * min(step / SCREENING_CORRELATION, 1.0)
+
+    def _filtered_bases(self) -> dict[tuple[str, Factor], FloatArray]:
+        """One filtered column (T, C) per site and factor."""
+        wanted = list(dict.fromkeys((p.site, p.factor) for law in self.laws for p in law.places))
+        found: dict[tuple[str, Factor], FloatArray] = {}
+        for start in range(0, len(wanted), 8):
+            keys = wanted[start : start + 8]
+            first = factor_values(self.sites.variables, keys[0][1])
+            torques = np.zeros((len(first), len(self.sites.names), len(keys)))
+            for k, (site, factor) in enumerate(keys):
+                torques[:, self.sites.names.index(site), k] = factor_values(self.sites.variables, factor)
+            columns = self.sites.columns(torques)
+            found |= {key: columns[:, :, k] for k, key in enumerate(keys)}
+        return found
+
+    def _of(self, law: Law, place: Place) -> FloatArray:
+        key = (law.basis, place.arguments)
+        if key not in self._functions:
+            self._functions[key] = law.basis.functions([combined(self._variables, a) for a in place.arguments])
+        return self._functions[key]
