@@ -255,7 +255,7 @@ DEFAULT_TOLERANCES: Mapping[str, Tolerance] = {
     # Tyre and whatever suspends the wheel act as one spring, and hardly anybody has measured it.
     "contact.stiffness": Tolerance(0.5, "1", True),
     "contact.relaxation_length": Tolerance(0.5, "m", True),
-    # Of one wheel, along or across, against the mean of all: on a floor that is not quite flat four wheels share the load anyhow.
+    # Of one wheel, along or across, against all: on a floor that is not quite flat four wheels share the load anyhow.
     "contact.stiffness_spread": Tolerance(0.1, "1", False),
     # What passes for a level floor: 2 mm in a metre.
     "ground.slope": Tolerance(0.002, "rad", False),

@@ -20,6 +20,7 @@ from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.findings import (
     VERDICTS,
     ChannelFinding,
+    ChannelProof,
     EffectFinding,
     Findings,
     FitFinding,
@@ -27,12 +28,23 @@ from pcw_sim_bridge.mismatch.findings import (
     LadderFinding,
     LocationFinding,
     ParameterFinding,
+    Place,
+    ResidualMap,
     RetunedFinding,
+    RolloutProof,
     Trace,
     UnknownFinding,
 )
 from pcw_sim_bridge.mismatch.report import check_output, write_report
-from pcw_sim_bridge.mismatch.report_figures import binned, envelope, timeline, worst_window
+from pcw_sim_bridge.mismatch.report_figures import (
+    MOST_TRACES,
+    binned,
+    envelope,
+    telling,
+    timeline,
+    worst_window,
+)
+from pcw_sim_bridge.mismatch.report_maps import binned_rms, draw_maps
 
 PATCHED = {
     "format": "pcw_robot/1",
@@ -101,6 +113,7 @@ def demo_findings(samples: int = 4000) -> Findings:
                 "drive",
                 ((1.0, 6.5), (12.25, 19.75), *((20.0 + k, 20.5 + k) for k in range(9))),
                 {"drive_speed": (0.4, 12.7), "steer_angle": (-3.1, 3.1)},
+                Place(1.25, -0.5, 0.3),
             ),
             LocationFinding(("accelerometer/x",), (), "chassis", (), {}),
         ),
@@ -138,7 +151,18 @@ def demo_findings(samples: int = 4000) -> Findings:
             RetunedFinding("rear_right.steer_zero", "rad", 0.0, -0.0011, -0.0014, -0.0008, 0.002),
         ),
         fit=FitFinding(
-            "runs/chirp.mcap", (0.673, 0.0596), {"pose/x": (0.412, 0.021), "pose/yaw": (0.013, 0.0151)}, 0.982
+            "runs/chirp.mcap",
+            (0.673, 0.0596),
+            {"pose/x": (0.412, 0.021), "pose/yaw": (0.013, 0.0151)},
+            0.982,
+            gap_closed_ci95=(0.97, 0.99),
+            inverse_ci95=((0.64, 0.71), (0.057, 0.063)),
+            inverse_floor=0.05,
+            channels=(ChannelProof("chassis_force/x", 0.04, 0.71, 0.0451, (0.66, 0.75), (0.042, 0.047)),),
+            rollouts=(RolloutProof("yaw", 2.0, 0.011, 0.013, 0.0151, (0.012, 0.014), (0.0148, 0.0153)),),
+            rollout_gap_closed=0.91,
+            harm=0.16,
+            harm_at="yaw after 2 s",
         ),
         ladder=tuple(
             [
@@ -159,6 +183,18 @@ def demo_findings(samples: int = 4000) -> Findings:
             "Without a tracked pose, a common error of all wheel radii cannot be told from the gyro's scale.",
         ),
         seconds=4.21,
+        residual_map=demo_map(samples),
+        absent=(("imu/data", "faults of the sensor itself cannot be seen"),),
+    )
+
+
+def demo_map(samples: int) -> ResidualMap:
+    """A robot on a figure of eight whose residual is large on one of the loops."""
+    clock = np.arange(samples) / 120.0
+    path = np.stack([2.0 * np.sin(0.4 * clock), np.sin(0.8 * clock)], axis=1)
+    loud = 1.0 + 20.0 * (path[:, 0] > 1.0)
+    return ResidualMap(
+        loud, np.ones(samples), clock, {"speed": np.abs(np.cos(clock)), "steer_angle/rear_left": np.sin(clock)}, path
     )
 
 
@@ -191,6 +227,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # -- report.json ------------------------------------------------------------------------------------------------------
 
 NUMBER, TEXT, FLAG = "number", "text", "flag"
+ERRORS = {
+    "floor": NUMBER, "before": NUMBER, "after": NUMBER, "before_ci95": (NUMBER, NUMBER), "after_ci95": (NUMBER, NUMBER),
+}  # fmt: skip
 CONTRACT = {
     "format": TEXT,
     "verdict": TEXT,
@@ -223,17 +262,25 @@ CONTRACT = {
     "unknown": [
         {"channel": TEXT, "depends_on": [TEXT], "expression": {"?": TEXT}, "share_explained": NUMBER}
     ],
-    # `source` (what was held out, in words) is an addition inside.
+    # Beside what the contract has, all that is said of it more closely.
     "fit": {
         "holdout": {
             "source": TEXT,
             "inverse_nrmse": (NUMBER, NUMBER),
+            "inverse_ci95": {"?": ((NUMBER, NUMBER), (NUMBER, NUMBER))},
+            "inverse_floor": {"?": NUMBER},
             "rollout": {"*": (NUMBER, NUMBER)},
             "gap_closed": NUMBER,
+            "gap_closed_ci95": {"?": (NUMBER, NUMBER)},
+            "rollout_gap_closed": {"?": NUMBER},
+            "harm": NUMBER,
+            "harm_at": {"?": TEXT},
+            "per_channel": [{"name": TEXT, **ERRORS}],
+            "horizons": [{"signal": TEXT, "horizon_s": NUMBER, **ERRORS}],
         }
     },
 }
-ADDITIONS = {"retuned", "ladder", "notes"}
+ADDITIONS = {"retuned", "ladder", "notes", "absent"}
 
 
 def check_structure(value: Any, wanted: Any, where: str = "report") -> None:
@@ -343,7 +390,7 @@ def test_page_refers_to_nothing_outside_itself(demo: Path) -> None:
 def test_every_figure_of_the_page_is_a_file_too(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
     files = sorted((demo / "figures").iterdir())
-    assert len(files) == 3 * len(demo_findings().traces)
+    assert len(files) == 1 + 3 * len(demo_findings().traces)
     assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
     assert page.count("<img") == len(files)
 
@@ -397,7 +444,7 @@ def test_page_shows_numbers_with_the_digits_they_have(demo: Path) -> None:
     assert page.count('<span class="tag part">beyond 3 tolerances</span>') == 1, (
         "only the radius moved by more than 3"
     )
-    assert page.count('<span class="tag bad">worse</span>') == 1, "only the rollout of the yaw got worse"
+    assert page.count('<span class="tag bad">worse</span>') == 2, "only the yaw got worse, in both tables"
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -547,6 +594,33 @@ def test_bin_means_follow_the_dependence() -> None:
     rows = binned(speed, np.sign(speed) + 0.1 * rng.standard_normal(20000))
     np.testing.assert_allclose(rows[:, 1], np.sign(rows[:, 0]), atol=0.02)
     np.testing.assert_allclose(rows[:, 3] - rows[:, 2], 2.0 * 1.2816 * 0.1, rtol=0.12)
+
+
+def test_of_many_channels_those_are_drawn_that_the_patch_changes_most() -> None:
+    """Both roles of a channel together, so that fitted and held out can be compared."""
+    quiet = [make_trace(f"quiet/{k}", "N", role) for k in range(9) for role in ("fit", "holdout")]
+    quiet = [dataclasses.replace(trace, after=trace.before) for trace in quiet]
+    loud = [make_trace("loud", "N", role) for role in ("fit", "holdout")]
+    chosen = telling([*quiet, *loud])
+    assert [(trace.channel, trace.role) for trace in chosen[:2]] == [("loud", "fit"), ("loud", "holdout")]
+    assert len(chosen) <= MOST_TRACES
+
+
+def test_bins_of_a_map_hold_the_power_that_is_there() -> None:
+    """A residual that grows with the variable; a sample that could not be judged counts nowhere."""
+    values = np.linspace(0.0, 2.0, 4000)
+    side = 1.0 + values
+    side[1000] = np.nan
+    centre, level = binned_rms(values, side)
+    np.testing.assert_allclose(level, 1.0 + centre, rtol=1e-3)
+
+
+def test_map_of_nothing_that_could_be_judged_is_drawn() -> None:
+    """All of it at a standstill; and a bench has no floor."""
+    nothing = np.full(50, np.nan)
+    path = np.zeros((50, 2))
+    drawn = [draw_maps(ResidualMap(nothing, nothing, np.arange(50.0), {}, on_floor)) for on_floor in (path, None)]
+    assert drawn[0].height > drawn[1].height
 
 
 def test_six_long_traces_take_less_than_three_seconds(tmp_path: Path) -> None:
@@ -753,7 +827,7 @@ def test_browser_shows_the_page_without_console_message_or_request(demo: Path, t
     page = demo / "report.html"
     dom, log, requests = open_in_chromium(page, tmp_path)
     assert "Coulomb friction of 0.412 N m in the drive of rear_left." in dom
-    assert dom.count("<img") == 9
+    assert dom.count("<img") == 10
     assert [line for line in log.splitlines() if "CONSOLE" in line] == []
     assert [request["url"] for request in requests] == []
 

@@ -94,7 +94,7 @@ class Effect:
     @property
     def searched_parameters(self) -> tuple[EffectParameter, ...]:
         """The parameters whose size, beginning at none, a derivative can find."""
-        return tuple(parameter for parameter in self.parameters if parameter.linear or parameter.near_linear or parameter.reciprocal)
+        return tuple(p for p in self.parameters if p.linear or p.near_linear or p.reciprocal)
 
     @property
     def nonlinear_parameters(self) -> tuple[EffectParameter, ...]:

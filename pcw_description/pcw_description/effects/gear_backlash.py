@@ -20,7 +20,9 @@ EFFECT = TransmissionEffect(
     sentence="A play of {play:.3g} rad in the gear of the {joint} of {target}.",
     parameters=(
         EffectParameter("play", "rad", "joint angle between the two flanks", 0.0, 0.5, 0.005, near_linear=True),
-        EffectParameter("tooth_stiffness", "N m/rad", "of the engaged teeth, joint side", 10.0, 1e7, 5e3, default=5e3, reciprocal=True),
+        EffectParameter(
+            "tooth_stiffness", "N m/rad", "of the engaged teeth, joint side", 10.0, 1e7, 5e3, default=5e3, reciprocal=True
+        ),
         EffectParameter("tooth_damping", "N m s/rad", "of the engaged teeth, joint side", 0.0, 1e4, 1.0, default=1.0),
     ),
     sensors=("joint_states",),

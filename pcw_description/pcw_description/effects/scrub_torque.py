@@ -21,7 +21,9 @@ EFFECT = DescriptionEffect(
     axis="steer",
     summary="The contact patch resists turning about the vertical, most of all on the spot.",
     sentence="A contact patch with {radius:.3g} m more scrub radius under {target}.",
-    parameters=(EffectParameter("radius", "m", "what the effective radius of the patch is more", 0.0, 0.1, 5e-3, near_linear=True),),
+    parameters=(
+        EffectParameter("radius", "m", "what the effective radius of the patch is more", 0.0, 0.1, 5e-3, near_linear=True),
+    ),
     sensors=("joint_states",),
     look_alikes=("steer_coulomb_friction", "steer_viscous_friction"),
     separating_experiment="steer at standstill and while rolling fast: scrub fades with speed, friction does not",

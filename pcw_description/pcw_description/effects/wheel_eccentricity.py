@@ -22,7 +22,9 @@ EFFECT = ContactEffect(
     summary="The axle is beside the middle of the tread: the rolling radius swings once per turn of the wheel.",
     sentence="The wheel of {target} runs out of true by {eccentricity:.3g} m, highest at {phase:.3g} rad before its zero.",
     parameters=(
-        EffectParameter("eccentricity", "m", "distance of the axle from the middle of the tread", 0.0, 0.1, 5e-4, near_linear=True),
+        EffectParameter(
+            "eccentricity", "m", "distance of the axle from the middle of the tread", 0.0, 0.1, 5e-4, near_linear=True
+        ),
         EffectParameter("phase", "rad", "roll angle from which the highest point is counted", -6.3, 6.3, 0.0, default=0.0),
     ),
     sensors=("joint_states", "imu/data"),

@@ -180,7 +180,10 @@ def draw_bench_case(
             "inertia": inertia,
             "tolerances": {"inertia": "2 %"},
         }
-        | ({} if described_arm is None else {"gravity_arm": {**described_arm, "moment": moment * described_arm.get("moment", 1.0)}})
+        | (
+            {} if described_arm is None
+            else {"gravity_arm": {**described_arm, "moment": moment * described_arm.get("moment", 1.0)}}
+        )
     )
     true_inertia = inertia * (1.0 + 0.02 * float(np.clip(rng.standard_normal(), -2.5, 2.5)))
     level = noise if noise is not None else 10.0 ** rng.uniform(-2.3, -1.3)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import stats
@@ -145,7 +145,9 @@ def explain(
     judgement = judge(search, _with_whole_numbers(search, search.run()))
     search, selection, result = judgement.search, judgement.selection, judgement.result
     problem = search.problem
-    suspect, undecided, remarks = None, {}, ()
+    suspect: Refinement | None = None
+    undecided: Mapping[Instance, float] = {}
+    remarks: tuple[str, ...] = ()
     refined = _refined(search, selection, result)
     if refined is not None:
         finished = OpenSetTest(search, refined.instances).run(selection.threshold)
@@ -201,6 +203,21 @@ def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection
     return selection if instances == selection.fit.instances else search.conclude(instances, selection.threshold)
 
 
+def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
+    """Return the explanation by these effects alone: fitted again, and what is left tested again."""
+    search, threshold = explanation.search, explanation.selection.threshold
+    selection = search.conclude(instances, threshold)
+    result = OpenSetTest(search, selection.fit.instances).run(threshold)
+    return dataclasses.replace(
+        explanation,
+        selection=selection,
+        named=named_terms(search, selection),
+        leftovers=result.leftovers,
+        floor=result.floor,
+        p_values=_p_values(search, selection, result),
+    )
+
+
 def _doubted(entry: NamedTerm, rival: str, undecided: Mapping[Instance, float]) -> NamedTerm:
     """The entry, said to be ambiguous with a refined effect if the recording does not decide between them."""
     if entry.instance not in undecided:
@@ -224,7 +241,9 @@ def _remarks(search: EffectSearch, plain: Selection, refined: _Refined) -> tuple
             f"{term.parameters[k].name} = {value:.3g} {term.parameters[k].unit}"
             for k, value in zip(instance.active, values, strict=True)
         )
-        remarks.append(f"With a symmetric {law} there would be {term.effect} ({numbers}); with the refined one the recordings {fate}.")
+        remarks.append(
+            f"With a symmetric {law} there would be {term.effect} ({numbers}); with the refined one the recordings {fate}."
+        )
     return tuple(remarks)
 
 

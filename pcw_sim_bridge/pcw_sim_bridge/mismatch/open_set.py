@@ -24,7 +24,7 @@ from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import FloatArray, IntArray, RegressionProblem
 from .unknown_law import UNKNOWN, Law
-from .whitened_regression import Fit, Instance, WhitenedRegression
+from .whitened_regression import Instance, WhitenedRegression
 
 HAT_KNOTS = 9
 HARMONICS = 3
@@ -138,17 +138,6 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
 def is_unknown(problem: RegressionProblem, instance: Instance) -> bool:
     """Whether an instance is a law outside the library."""
     return problem.terms[instance.term].effect == UNKNOWN
-
-
-def names_only(problem: RegressionProblem, fit: Fit) -> Fit:
-    """Return a joint fit without the laws outside the library: what a patched description holds."""
-    keep = np.ones(len(fit.mean), dtype=bool)
-    position = len(problem.nuisances)
-    for instance in fit.instances:
-        keep[position : position + len(instance.active)] = not is_unknown(problem, instance)
-        position += len(instance.active)
-    instances = tuple(i for i in fit.instances if not is_unknown(problem, i))
-    return dataclasses.replace(fit, instances=instances, mean=fit.mean[keep], covariance=fit.covariance[np.ix_(keep, keep)])
 
 
 def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tuple[EffectSearch, Selection, Law]:

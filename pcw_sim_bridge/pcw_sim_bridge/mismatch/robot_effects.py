@@ -91,7 +91,8 @@ def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[Rob
         pose[:, 0] = pose[0, 0] + _integral(c * twist[:, 0] - s * twist[:, 1], steps)
         pose[:, 1] = pose[0, 1] + _integral(s * twist[:, 0] + c * twist[:, 1], steps)
         found.append(dataclasses.replace(motion, pose=pose))
-        last_rate = np.array([c[-1] * twist[-1, 0] - s[-1] * twist[-1, 1], s[-1] * twist[-1, 0] + c[-1] * twist[-1, 1], twist[-1, 2]])
+        vx, vy, omega = twist[-1]
+        last_rate = np.array([c[-1] * vx - s[-1] * vy, s[-1] * vx + c[-1] * vy, omega])
     return found
 
 
@@ -211,10 +212,8 @@ class ChannelModel:
             axis = AXIS_NAMES.index(instance.axis or effect.axis)
             for name in instance.target:
                 i = self.robot.caster_index(name)
-                signals = (motion.position, motion.velocity, motion.torque)
-                torque[:, i, axis] += effect.contribution(
-                    *(signal[:, i, axis] for signal in signals), normal[:, i], instance.parameters
-                )
+                position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.torque))
+                torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
             return dataclasses.replace(around, torque=torque)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
         grip = np.ones(shape[:2]) if around.grip is None else around.grip.copy()
@@ -246,7 +245,7 @@ class ChannelModel:
         return found
 
     def _climbing(self, motion: RobotMotion, i: int, normal: FloatArray, found: FloatArray) -> FloatArray:
-        """Drive torque (T,) that would push like a wheel's load on a slope of the ground; the side force is in the steering's."""
+        """Drive torque (T,) that would push like a wheel's load on sloping ground; the side force is in the steering's."""
         heading = motion.pose[:, 2] + motion.position[:, i, STEER]
         slope = np.cos(heading) * found[:, GRADIENT_X] + np.sin(heading) * found[:, GRADIENT_Y]
         torque: FloatArray = -self.numbers.radius[i] * normal * slope

@@ -113,8 +113,8 @@ class _TermMaker:
             for found in torques.values():
                 found.append(np.zeros(motion.position.shape))
             for i in casters:
-                signals = (motion.position, motion.velocity, motion.torque)
-                by_name = effect.regressor(*(signal[:, i, column] for signal in signals), normal[:, i], shape)
+                position, velocity, force = (s[:, i, column] for s in (motion.position, motion.velocity, motion.torque))
+                by_name = effect.regressor(position, velocity, force, normal[:, i], shape)
                 for name, values in by_name.items():
                     torques[name][-1][:, i, column] = values
         return np.stack([self.differences.of_torque(pieces) for pieces in torques.values()], axis=2)

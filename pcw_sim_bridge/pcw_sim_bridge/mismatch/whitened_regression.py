@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 from scipy import linalg
 
 from .noise_model import NoiseModel
@@ -197,7 +198,7 @@ class WhitenedRegression:
         self._bank = _ColumnBank(self.blocks, self.rows)
         self._base = self._bank.add(np.concatenate([self.nuisance, self.target[:, None]], axis=1))
         self._places: dict[tuple[int, Frozen], slice] = {}
-        self._long_scans: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._long_scans: dict[int, tuple[npt.NDArray[np.float32], FloatArray]] = {}
         self._short_scans: list[_ScanGroup] | None = None
 
     def _rows(self, values: FloatArray) -> FloatArray:
@@ -303,16 +304,16 @@ class WhitenedRegression:
 
     # -- scan ---------------------------------------------------------------------------------------------------
 
-    def _long_scan(self, term_index: int) -> tuple[FloatArray, FloatArray]:
+    def _long_scan(self, term_index: int) -> tuple[npt.NDArray[np.float32], FloatArray]:
         """Whitened scan columns (R, shapes, P) of a term with a long grid, and their Gram matrices (shapes, P, P)."""
         if term_index not in self._long_scans:
             term = self.problem.terms[term_index]
             base = term.scan()[..., list(term.base_indices())]  # type: ignore[misc]
             samples, channels, shapes, width = base.shape
             white = self._rows(base.reshape(samples, channels, shapes * width))
-            white = white.astype(np.float32).reshape(-1, shapes, width)
-            gram = np.einsum("rsp,rsq->spq", white, white, optimize=True).astype(float)
-            self._long_scans[term_index] = (white, gram)
+            narrow = white.astype(np.float32).reshape(-1, shapes, width)
+            gram = np.einsum("rsp,rsq->spq", narrow, narrow, optimize=True).astype(float)
+            self._long_scans[term_index] = (narrow, gram)
         return self._long_scans[term_index]
 
     def _short_scan(self) -> list[_ScanGroup]:
@@ -424,7 +425,7 @@ class WhitenedRegression:
     ) -> None:
         """Add the best shape of every term to the results, with its gain marginal over the shapes; gains (keys, N)."""
         terms = np.array([index for index, _ in keys])
-        starts = np.flatnonzero(np.r_[True, np.diff(terms) != 0])
+        starts = np.flatnonzero(np.r_[True, np.diff(terms) != 0]).tolist()
         for start, stop in zip(starts, [*starts[1:], len(terms)], strict=True):
             gain = gains[start:stop]
             best = np.argmax(gain, axis=0)
