@@ -142,7 +142,9 @@ class Recording:
         return recording
 
     @classmethod
-    def of_messages(cls, messages: Sequence[RawMessage], robot: RobotDescription | None = None, name: str = "live") -> Recording:
+    def of_messages(
+        cls, messages: Sequence[RawMessage], robot: RobotDescription | None = None, name: str = "live"
+    ) -> Recording:
         """Read messages that are in memory, in the order they came, as if they had been recorded.
 
         Args:
