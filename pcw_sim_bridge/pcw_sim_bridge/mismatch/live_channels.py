@@ -6,8 +6,9 @@
 
 First it learns: of `learning` seconds of motion of a healthy robot it takes the numbers of the description within their
 tolerances and the noise that remains (`live_tuning`). From then on every channel is judged over the last `horizon`: the
-rms of its residual after re-tuning over the deviation of a healthy one. Healthy motion goes on to be learned from, with
-a memory that fades; what departs is not, nor what came shortly before.
+rms of its residual after re-tuning over the deviation of a healthy one. What departs but little shows over longer: the same
+is asked of the last LASTING horizons, with a lower threshold. Healthy motion goes on to be learned from, with a memory that
+fades; what departs is not, nor what came shortly before.
 """
 
 from __future__ import annotations
@@ -29,14 +30,16 @@ from .live_rows import LONGEST_WINDOW, NANOSECONDS, RowReader, Rows
 from .live_suspects import Suspect, find_suspect
 from .live_tuning import Tuning, digest
 from .message_ring import MessageRing
+from .regression_problem import FloatArray
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
 
 # A channel is judged when at least this part of the horizon may be.
 JUDGED_SHARE = 0.3
 # It is healthy again below this part of the threshold that it had passed.
 HYSTERESIS = 0.8
-# Rows wait so many horizons before they are learned from, so that none of a beginning fault is.
-QUARANTINE = 3
+# A weak departure is looked for over so many horizons, with this part of the threshold. Rows wait as long before they are
+# learned from, so that none of a beginning fault is.
+LASTING, LASTING_SHARE = 8, 0.625
 # The ring holds so many times the learning time, should the robot stand in between.
 LEARNING_SPAN = 3.0
 LARGEST_RING = 256 * 2**20  # [bytes]
@@ -63,7 +66,8 @@ class LiveParameters:
         learning: motion of a healthy robot to learn from [s].
         memory: time constant with which healthy motion is forgotten again [s].
         horizon: what is judged at once [s].
-        warn, error: deviations from which a channel warns, and is an error.
+        warn, error: deviations from which a channel warns, and is an error; over LASTING horizons a channel warns from
+            LASTING_SHARE of `warn` on.
     """
 
     learning: float = 20.0
@@ -92,6 +96,7 @@ class ChannelState:
 
     Attributes:
         residual: rms after re-tuning, in `unit`; normalised: in deviations of a healthy robot, about 1 where nothing departs.
+        lasting: the same over the last LASTING horizons.
         since: stamp from which it departs [s]; None where it does not.
     """
 
@@ -99,6 +104,7 @@ class ChannelState:
     unit: str
     residual: float
     normalised: float
+    lasting: float
     level: Level
     since: float | None
 
@@ -151,7 +157,7 @@ class LiveChannels:
         self._moved: deque[tuple[int, float]] = deque()  # log time and length of the pieces with motion
         self._read_until: int | None = None  # log time
         self._now: int | None = None
-        self._recent: Rows | None = None  # of the horizon
+        self._recent: Rows | None = None  # of the last LASTING horizons
         self._waiting: deque[Rows] = deque()  # to be learned from
         self._since: dict[str, float] = {}
         self._level: dict[str, Level] = {}
@@ -258,7 +264,7 @@ class LiveChannels:
             rows_now = self._recent.followed_by(rows)
         else:
             rows_now = rows
-        self._recent = rows_now[rows_now.time > rows.time[-1] - self.parameters.horizon]
+        self._recent = rows_now[rows_now.time > rows.time[-1] - LASTING * self.parameters.horizon]
         channels, silent = self._states(tuning, self._recent)
         self._look_for_suspect(reader, tuning, float(rows.time[-1]))
         self._go_on_learning(tuning, rows, channels)
@@ -268,29 +274,33 @@ class LiveChannels:
         )
 
     def _states(self, tuning: Tuning, rows: Rows) -> tuple[tuple[ChannelState, ...], tuple[str, ...]]:
-        residual, standard = tuning.residual(rows), tuning.residual(rows) / tuning.deviation(rows)
+        residual = tuning.residual(rows)
+        standard = residual / tuning.deviation(rows)
+        now = rows.time > rows.time[-1] - self.parameters.horizon
         states, silent = [], []
         for c, channel in enumerate(tuning.layout.channels):
             valid = rows.valid[:, c]
-            if valid.mean() < JUDGED_SHARE:
+            if valid[now].mean() < JUDGED_SHARE:
                 silent.append(channel.name)
                 continue
-            normalised = float(np.sqrt(np.mean(standard[valid, c] ** 2)))
-            level = self._level_of(channel.name, normalised)
+            normalised, lasting = _rms(standard[valid & now, c]), _rms(standard[valid, c])
+            level = self._level_of(channel.name, normalised, lasting)
             if level is Level.OK:
                 self._since.pop(channel.name, None)
             elif channel.name not in self._since:
-                begun = valid & (np.abs(standard[:, c]) > self.parameters.warn)
-                self._since[channel.name] = float(rows.time[np.argmax(begun)] if begun.any() else rows.time[-1])
-            rms = float(np.sqrt(np.mean(residual[valid, c] ** 2)))
-            states.append(ChannelState(channel.name, channel.unit, rms, normalised, level, self._since.get(channel.name)))
+                self._since[channel.name] = onset(rows.time[valid], standard[valid, c], max(normalised, lasting))
+            since = self._since.get(channel.name)
+            rms = _rms(residual[valid & now, c])
+            states.append(ChannelState(channel.name, channel.unit, rms, normalised, lasting, level, since))
         return tuple(states), tuple(silent)
 
-    def _level_of(self, name: str, normalised: float) -> Level:
+    def _level_of(self, name: str, normalised: float, lasting: float) -> Level:
+        warn, error = self.parameters.warn, self.parameters.error
         before = self._level.get(name, Level.OK)
         level = Level.OK
-        for candidate, threshold in ((Level.WARN, self.parameters.warn), (Level.ERROR, self.parameters.error)):
-            if normalised > threshold * (HYSTERESIS if before >= candidate else 1.0):
+        sizes = {Level.WARN: max(normalised / warn, lasting / (LASTING_SHARE * warn)), Level.ERROR: normalised / error}
+        for candidate, size in sizes.items():
+            if size > (HYSTERESIS if before >= candidate else 1.0):
                 level = candidate
         self._level[name] = level
         return level
@@ -300,7 +310,7 @@ class LiveChannels:
             self._waiting.clear()
             return
         self._waiting.append(rows)
-        due = rows.time[-1] - QUARANTINE * self.parameters.horizon
+        due = rows.time[-1] - LASTING * self.parameters.horizon
         while self._waiting[0].time[-1] < due:
             learned = self._waiting.popleft()
             duration = float(learned.time[-1] - learned.time[0])
@@ -321,6 +331,20 @@ class LiveChannels:
         assert self._now is not None
         window = reader.read_again(self._ring.since(self._now - round(span * NANOSECONDS)))
         self._suspect = find_suspect(tuning, window, begun) or self._suspect
+
+
+def onset(time: FloatArray, standard: FloatArray, size: float) -> float:
+    """Estimate from when on standardised residuals (T,) of deviation 1 have the deviation `size`, at stamps (T,).
+
+    The maximum over t0 of sum_{t >= t0} (z_t^2 - threshold), with the threshold midway and single values bounded.
+    """
+    threshold = 0.5 * (1.0 + size**2)
+    excess = np.minimum(standard**2, 4.0 * threshold) - threshold
+    return float(time[np.argmax(np.cumsum(excess[::-1])[::-1])])
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def header_stamp(cdr: bytes) -> int:

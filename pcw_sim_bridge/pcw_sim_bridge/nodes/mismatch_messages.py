@@ -54,4 +54,5 @@ def _said(channel: ChannelState, stamp: float | None) -> str:
     if channel.since is None:
         return f"within {channel.normalised:.1f} deviations of a healthy robot"
     ago = "" if stamp is None else f", {max(stamp - channel.since, 0.0):.1f} s ago"
-    return f"departs by {channel.normalised:.1f} deviations, since stamp {channel.since:.3f} s{ago}"
+    size = max(channel.normalised, channel.lasting)
+    return f"departs by {size:.1f} deviations, since stamp {channel.since:.3f} s{ago}"
