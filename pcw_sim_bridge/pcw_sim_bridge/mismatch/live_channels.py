@@ -32,6 +32,7 @@ from .live_tuning import Tuning, digest
 from .message_ring import MessageRing
 from .regression_problem import FloatArray
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
+from .robot_motion import SHORTEST_SEGMENT
 
 # A channel is judged when at least this part of the horizon may be.
 JUDGED_SHARE = 0.3
@@ -255,7 +256,10 @@ class LiveChannels:
     def _judge(self, reader: RowReader, tuning: Tuning) -> Judgement:
         assert self._now is not None
         elapsed = (self._now - self._read_until) / NANOSECONDS if self._read_until is not None else 0.0
-        window = reader.read(self._ring.since(self._now - round(reader.span(elapsed) * NANOSECONDS)))
+        messages = self._ring.since(self._now - round(reader.span(elapsed) * NANOSECONDS))
+        if not messages or self._now - messages[0].log_time_ns < SHORTEST_SEGMENT * NANOSECONDS:
+            return self._nothing()  # it has just begun
+        window = reader.read(messages)
         self._read_until = self._now
         rows, missing = tuning.layout.arranged(window.layout, window.rows)
         if not len(rows):

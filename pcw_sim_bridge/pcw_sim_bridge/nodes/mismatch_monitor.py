@@ -71,8 +71,9 @@ class MismatchMonitorNode(Node):
         self._live = LiveChannels(self.robot, parameters, tuning)
         self._saved = bool(calibration)
         self._judgement: Judgement | None = None
+        self._departed = ""  # what departed when there was last something to judge
         self._counts = dict.fromkeys(TOPICS, 0)
-        self._reported = (time.monotonic(), dict(self._counts))
+        self._reported = (time.monotonic(), time.process_time(), dict(self._counts))
         self._fresh = False  # joint_states since the last judgement
         self._problems = Problems(self)
         self._publisher = self.create_publisher(JointState, "mismatch", SENSOR_SOURCE)
@@ -116,7 +117,7 @@ class MismatchMonitorNode(Node):
 
     def _on_learn(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._live.learn_again()
-        self._judgement = None
+        self._judgement, self._departed = None, ""
         response.success = True
         response.message = f"learning from the next {self._live.parameters.learning:g} s of motion"
         return response
@@ -131,6 +132,7 @@ class MismatchMonitorNode(Node):
             for problem in judgement.problems:
                 self._problems.add(problem)
             if judgement.channels and judgement.stamp is not None:
+                self._departed = "" if judgement.level is Level.OK else departure_text(judgement)
                 self._publisher.publish(mismatch_message(judgement.channels, judgement.stamp))
             if judgement.ready and not self._saved:
                 self._save()
@@ -154,7 +156,7 @@ class MismatchMonitorNode(Node):
             if self._judgement is not None and self._judgement.level is not Level.OK:
                 begun = self._keeper.departs()
                 if begun is not None:
-                    self.get_logger().warning(f"{departure_text(self._judgement)}; keeping {begun}")
+                    self.get_logger().warning(f"{self._departed}; keeping {begun}")
             finished = self._keeper.work()
             if finished is not None:
                 self.get_logger().info(f"kept {finished}")
@@ -169,13 +171,14 @@ class MismatchMonitorNode(Node):
     # --- Diagnostics ------------------------------------------------------------------------------------
 
     def _status(self) -> Status:
-        now, before = (time.monotonic(), dict(self._counts)), self._reported
+        now, before = (time.monotonic(), time.process_time(), dict(self._counts)), self._reported
         self._reported = now
         elapsed = max(now[0] - before[0], 1e-9)
-        rates = {topic: (now[1][topic] - before[1][topic]) / elapsed for topic in TOPICS if TOPICS[topic][2]}
+        rates = {topic: (now[2][topic] - before[2][topic]) / elapsed for topic in TOPICS if TOPICS[topic][2]}
         values: dict[str, object] = {f"rate of {topic} [Hz]": value for topic, value in rates.items()}
         values["missing"] = ", ".join(topic for topic in rates if not self._counts[topic]) or "none"
         values["clock_restarts"] = self._live.restarts
+        values["share_of_core"] = (now[1] - before[1]) / elapsed
         if self._keeper is not None:
             values["kept"] = len(self._keeper.kept)
         judgement, problems = self._judgement, self._problems.take()
@@ -187,13 +190,17 @@ class MismatchMonitorNode(Node):
             text = "joint_states is silent" if self._counts["joint_states"] else "waiting for joint_states"
             return Status(WARN, text, values)
         if judgement is not None and judgement.level is not Level.OK:
-            return Status(LEVELS[judgement.level], departure_text(judgement), values)
+            return Status(LEVELS[judgement.level], self._departed, values)
         if problems:
             return Status(WARN, problems, values)
         if judgement is None or not judgement.ready:
             learned = 0.0 if judgement is None else judgement.learned
             return Status(OK, f"learning: {learned:.0f} of {self._live.parameters.learning:g} s of motion", values)
-        return Status(OK, "nothing departs" if judgement.channels else "standing still, or nothing to judge", values)
+        if judgement.channels:
+            return Status(OK, "nothing departs", values)
+        if self._departed:
+            return Status(WARN, f"nothing to judge now; before: {self._departed}", values)
+        return Status(OK, "standing still, or nothing to judge", values)
 
 
 def main(args: Sequence[str] | None = None) -> int:
