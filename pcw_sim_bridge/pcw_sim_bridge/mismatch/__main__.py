@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 from pcw_description.errors import PcwError
 
-from .commands import analyze
+from .commands import analyze, fleet
 
-COMMANDS = (analyze,)
+COMMANDS = (analyze, fleet)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -50,7 +50,8 @@ class RobotSubject:
         recording = Recording.open(path, self.robot, topics)
         self._check_sensors(path, recording)
         warnings = tuple(f"{warning.topic}: {warning.text}" for warning in recording.warnings)
-        return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, warnings))
+        started = recording.t0_ns * 1e-9
+        return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, warnings, started))
 
     def _check_sensors(self, path: Path, recording: Recording) -> None:
         """All recordings of one analysis have the same channels, those held out too."""
