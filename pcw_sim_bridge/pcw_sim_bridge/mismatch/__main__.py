@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 from pcw_description.errors import PcwError
 
-from .commands import analyze, fleet
+from .commands import analyze, fleet, suggest
 
-COMMANDS = (analyze, fleet)
+COMMANDS = (analyze, fleet, suggest)
 
 
 def parser() -> argparse.ArgumentParser:
