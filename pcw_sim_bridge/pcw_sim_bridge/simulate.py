@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
         "--physics '{name: drive_coulomb_friction, target: [front_left], coulomb: 0.5}'",
     )
     options.add_argument("--robot", default="thesis", help="robot file, or the name of a shipped robot (default: thesis)")
-    options.add_argument("--excite", metavar="NAME", help="excitation, see --list-excitations; or a file from mismatch suggest")
+    options.add_argument("--excite", metavar="NAME", help="excitation, see --list-excitations, or file of mismatch suggest")
     options.add_argument("--duration", type=float, metavar="SECONDS", help="length (default: that of the excitation)")
     options.add_argument("--seed", type=int, default=0, help="of all noise and of what the excitation draws (default: 0)")
     options.add_argument("--out", type=Path, metavar="BAG", help="folder to make; one that exists is left as it is")

@@ -75,12 +75,12 @@ class FleetRobots:
     def robot_of(self, path: Path) -> tuple[str, str] | None:
         """Return name and description of the robot of a recording; None where no pattern fits.
 
-        The name is the part of the path that a pattern fits: with `amr_*:=thesis`, logs/amr_7/monday is of amr_7.
+        The name is the folder that a pattern fits: with `amr_*:=thesis`, logs/amr_7/monday is of amr_7.
         """
         for pattern, description in self.patterns:
             if pattern is None:
                 return self.subjects[description].name, description
-            for part in path.resolve().parts:
+            for part in path.resolve().parent.parts:
                 if fnmatch.fnmatchcase(part, pattern):
                     return part, description
         return None
@@ -118,7 +118,7 @@ def find_tasks(paths: Iterable[Path], robots: FleetRobots, topics: Mapping[str, 
             owner = robots.robot_of(path)
             if owner is None:
                 patterns = ", ".join(str(pattern) for pattern, _ in robots.patterns)
-                raise MismatchError(f"{path} belongs to no robot: no part of its path fits a pattern of --robot ({patterns})")
+                raise MismatchError(f"{path} belongs to no robot: no folder that it is in fits --robot {patterns}")
             robot, description = owner
             if path == given or robots.reads(description, path):
                 task = Task(str(path.resolve()), robot, description, digests[description], dict(topics), seed)

@@ -147,16 +147,20 @@ class RobotHistory:
             )
         short = self.verdicts.get("insufficient_data", 0)
         if short:
-            said.append(f"{short} recordings hold too little motion to judge.")
+            said.append(f"{_counted(short, 'recording holds', 'recordings hold')} too little motion to judge.")
         if self.failed:
-            said.append(f"{len(self.failed)} recordings could not be analysed.")
+            said.append(f"{_counted(len(self.failed), 'recording', 'recordings')} could not be analysed.")
         if self.other_descriptions:
-            said.append(f"{self.other_descriptions} earlier results were made with another description and are left out.")
+            made = _counted(self.other_descriptions, "earlier result was", "earlier results were")
+            said.append(f"{made} made with another description and left out.")
         if self.uncertain_times:
-            said.append(
-                f"{self.uncertain_times} recordings bear no date in their stamps; the time of their files stands for it."
-            )
+            bear = _counted(self.uncertain_times, "recording bears", "recordings bear")
+            said.append(f"{bear} no date in the stamps; the time of the file stands for it.")
         return said
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
 
 
 def date(time: float) -> str:

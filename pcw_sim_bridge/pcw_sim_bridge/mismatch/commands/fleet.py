@@ -27,10 +27,10 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAGS", help="recordings, or folders with recordings in them")
     parser.add_argument(
         "--robot", required=True, action="append", metavar="[PATTERN:=]DESCRIPTION",
-        help="description of all robots, or of those with a part of the path that PATTERN (* and ?) fits, which is then the "
-        "robot's name; repeatable, the first that fits counts",
+        help="description of all recordings, or of those in a folder whose name PATTERN (* and ?) fits: the folder is then "
+        "the robot's name. Repeatable, the first that fits counts",
     )
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for results and reports, kept between runs")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder of the results; earlier ones count")
     parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (default: one per core)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="Dask cluster to use instead, e.g. tcp://host:8786")
     parser.add_argument("--topic", action="append", default=[], metavar="NAME:=TOPIC", help="as for analyze")

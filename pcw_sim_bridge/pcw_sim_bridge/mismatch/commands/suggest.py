@@ -143,8 +143,8 @@ def read_effect(given: str, robot: RobotDescription) -> tuple[EffectInstance, bo
     name, _, target = given.partition("/")
     searched = get(name).searched_parameters
     entry: dict[str, Any] = {"name": name}
-    entry |= {p.name: p.typical for p in get(name).parameters if p.default is None or (p in searched and p.default == 0.0)}
-    entry.pop("asymmetry", None)
+    sized = (p for p in get(name).parameters if p.default is None or (p in searched and p.name != "asymmetry"))
+    entry |= {p.name: p.typical for p in sized}
     if target:
         entry["target"] = target.split("+")
     return read_physics([entry], robot.caster_names)[0], False
@@ -168,7 +168,7 @@ def read_report(
         named = [(_instance(effect), effect["ambiguous_with"]) for effect in report["effects"]]
         noise_floor = {channel["name"]: float(channel["noise_floor"]) for channel in report["channels"]}
     except OSError as error:
-        raise MismatchError(f"{path}: {error.strerror or error}; allowed: a folder that mismatch analyze has written") from None
+        raise MismatchError(f"{path}: {error.strerror or error}; allowed: a folder of mismatch analyze") from None
     except (ValueError, KeyError, TypeError):
         raise MismatchError(f"{path}: is no report of mismatch analyze") from None
     if noise_floor and "gyro" not in noise_floor:
