@@ -302,7 +302,7 @@ def trend(time: FloatArray, value: FloatArray, width: FloatArray) -> Trend | Non
 
 
 def _weighted_fit(design: FloatArray, value: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    covariance = np.linalg.inv(design.T @ (weight[:, None] * design))
+    covariance: FloatArray = np.linalg.inv(design.T @ (weight[:, None] * design)).astype(float)
     return covariance, covariance @ (design.T @ (weight * value))
 
 

@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     others: list[EffectInstance] = []
     noise_floor: dict[str, float] = {}
     if options.between is not None:
-        doubts = [between(*options.between, robot)]
+        doubts = [between(options.between[0], options.between[1], robot)]
     else:
         robot, doubts, others, noise_floor = read_report(options.report, robot)
     if not doubts:
@@ -173,7 +173,7 @@ def read_report(
         raise MismatchError(f"{path}: is no report of mismatch analyze") from None
     if noise_floor and "gyro" not in noise_floor:
         robot = dataclasses.replace(robot, sensors=dataclasses.replace(robot.sensors, imu=None))
-    doubts = []
+    doubts: list[Doubt] = []
     for effect, rivals in named:
         for rival in rivals:
             name, _, target = rival.partition("/")
