@@ -32,6 +32,7 @@ setup(
     install_requires=["setuptools"],
     extras_require={
         "test": ["pytest"],
+        "distributed": ["distributed>=2022.2.0"],  # a Dask cluster for mismatch fleet
         "mujoco": ["mujoco>=3.3.1"],  # the first with armature on tendons, which the rotors are
     },
     zip_safe=False,

@@ -9,7 +9,7 @@ from .computed_torque import (
     TwistReference,
 )
 from .errors import ControlError
-from .excitation import EXCITATIONS, Excitation, make_excitation
+from .excitation import EXCITATIONS, Excitation, make_excitation, read_excitation
 from .motion_range import MotionRange
 from .quintic_trajectory import MotionLimits, QuinticTrajectory, TrajectoryPoint, plan_point_to_point
 from .torque_limits import LimitedTorque, TorqueLimits, limit_torque
@@ -33,4 +33,5 @@ __all__ = [
     "limit_torque",
     "make_excitation",
     "plan_point_to_point",
+    "read_excitation",
 ]

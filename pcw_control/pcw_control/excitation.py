@@ -18,7 +18,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from pcw_description.errors import nearest_name
+from pcw_description.description_fields import load_yaml_mapping
+from pcw_description.errors import DescriptionError, nearest_name
 from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .computed_torque import ComputedTorqueParameters
@@ -39,6 +40,8 @@ from .excitation_segments import (
 )
 from .motion_range import MotionRange
 
+FORMAT = "pcw_excitation/1"
+FILE_KEYS = ("format", "name", "duration", "seed", "purpose")
 SHORTEST, LONGEST = 10.0, 3600.0  # [s]; below, no segment says anything
 CHIRP_FREQUENCIES = (0.1, 1.0)  # [Hz], beginning and end
 LARGEST_SPEED = 0.6  # [m/s], of anything but a coast-down: these robots drive among people
@@ -112,6 +115,38 @@ def make_excitation(name: str, robot: RobotDescription, duration: float | None =
             f"duration = {duration!r} s of excitation {name} is not allowed; allowed: {shortest:g} to {LONGEST:g} s"
         )
     return Excitation(name, plan.summary, tuple(plan.segments(planner, duration)), plan.lifted)
+
+
+def read_excitation(name: str, robot: RobotDescription, duration: float | None = None, seed: int = 0) -> Excitation:
+    """Make an excitation by its name, or as a file asks for it.
+
+    Args:
+        name: one of `EXCITATIONS`, or the path of a .yaml file of the format `pcw_excitation/1`: `name`, and as wanted
+            `duration` [s], `seed` and `purpose`, which says in words what it is driven for.
+        robot: see `make_excitation`.
+        duration: length [s], before that of the file; default: the file's, or its own.
+        seed: of what is drawn, where the file has none.
+
+    Raises:
+        DescriptionError: the file cannot be read, or one of its keys is not allowed.
+        ControlError, KinematicsError: as by `make_excitation`.
+    """
+    if not name.endswith((".yaml", ".yml")):
+        return make_excitation(name, robot, duration, seed)
+    content = load_yaml_mapping(name)
+    for key in content:
+        if key not in FILE_KEYS:
+            raise DescriptionError(str(key), content[key], f"unknown key; {nearest_name(str(key), FILE_KEYS)}")
+    if content.get("format") != FORMAT:
+        raise DescriptionError("format", content.get("format"), f"allowed: {FORMAT}")
+    chosen, length, drawn = content.get("name"), content.get("duration"), content.get("seed", seed)
+    if not isinstance(chosen, str):
+        raise DescriptionError("name", chosen, f"allowed: {', '.join(EXCITATIONS)}")
+    if length is not None and (isinstance(length, bool) or not isinstance(length, (int, float))):
+        raise DescriptionError("duration", length, f"allowed: {SHORTEST:g} to {LONGEST:g} s")
+    if isinstance(drawn, bool) or not isinstance(drawn, int) or drawn < 0:
+        raise DescriptionError("seed", drawn, "allowed: 0 and above")
+    return make_excitation(chosen, robot, duration if duration is not None else length, drawn)
 
 
 class _Planner:

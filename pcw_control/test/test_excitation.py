@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcw_control import ControlError, make_excitation
+from pcw_control import ControlError, make_excitation, read_excitation
 from pcw_control.excitation import CHIRP_FREQUENCIES, EXCITATIONS, FIGURE8_ANGLE, LONGEST, SHORTEST
 from pcw_control.motion_range import FORCE_SHARE, SPEED_SHARE, MotionRange
-from pcw_description import KinematicsError, load_robot, shipped_robots
+from pcw_description import DescriptionError, KinematicsError, load_robot, shipped_robots
 from pcw_description.differential_kinematics import inverse_kinematics
 
 ROBOTS = {name: load_robot(name) for name in shipped_robots() if name != "mpo700"}
@@ -225,3 +225,37 @@ def test_the_readme_lists_them_all():
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) s \| (\S.*) \|$", readme.partition("## Excitations")[2], re.MULTILINE)
     assert rows == [(name, f"{plan.duration:g}", plan.summary) for name, plan in EXCITATIONS.items()]
+
+
+def test_a_file_asks_for_an_excitation_and_the_caller_has_the_last_word(tmp_path):
+    """Name, length and seed of the file; a length given besides goes before."""
+    path = tmp_path / "goals.yaml"
+    path.write_text("{format: pcw_excitation/1, name: random_goals, duration: 40, seed: 3, purpose: to see what it does}")
+    asked = read_excitation(str(path), THESIS)
+    assert (asked.name, asked.duration) == ("random_goals", pytest.approx(40.0))
+    assert np.array_equal(twists(asked), twists(make_excitation("random_goals", THESIS, 40.0, 3)))
+    assert read_excitation(str(path), THESIS, 20.0).duration == pytest.approx(20.0)
+    path.write_text("{format: pcw_excitation/1, name: random_goals}")
+    by_file, by_name = (read_excitation(name, THESIS, 20.0, 5) for name in (str(path), "random_goals"))
+    assert np.array_equal(twists(by_file), twists(by_name))
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("{format: pcw_excitation/2, name: spin}", "format: 'pcw_excitation/2' is not allowed; allowed: pcw_excitation/1"),
+        ("{name: spin}", "format is missing; allowed: pcw_excitation/1"),
+        ("{format: pcw_excitation/1}", "name is missing"),
+        ("{format: pcw_excitation/1, name: spinn}", "did you mean 'spin'?"),
+        ("{format: pcw_excitation/1, name: spin, lenght: 20}", "lenght: 20 is not allowed; unknown key"),
+        ("{format: pcw_excitation/1, name: spin, duration: long}", "duration: 'long' is not allowed; allowed: 10 to 3600 s"),
+        ("{format: pcw_excitation/1, name: spin, duration: 5}", "duration = 5 s of excitation spin"),
+        ("{format: pcw_excitation/1, name: spin, seed: -1}", "seed: -1 is not allowed"),
+        ("[spin]", "it holds one list"),
+    ],
+)
+def test_a_file_that_is_not_allowed_says_what_is(tmp_path, content, says):
+    """Key, value and what is allowed."""
+    (tmp_path / "run.yaml").write_text(content)
+    with pytest.raises((ControlError, DescriptionError), match=re.escape(says)):
+        read_excitation(str(tmp_path / "run.yaml"), THESIS)

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from pcw_control.excitation import EXCITATIONS, make_excitation
+from pcw_control.excitation import EXCITATIONS, read_excitation
 from pcw_description.description_fields import load_yaml_mapping, parse_yaml
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import effects_text, read_physics
@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
         "--physics '{name: drive_coulomb_friction, target: [front_left], coulomb: 0.5}'",
     )
     options.add_argument("--robot", default="thesis", help="robot file, or the name of a shipped robot (default: thesis)")
-    options.add_argument("--excite", metavar="NAME", help="excitation, see --list-excitations")
+    options.add_argument("--excite", metavar="NAME", help="excitation, see --list-excitations, or file of mismatch suggest")
     options.add_argument("--duration", type=float, metavar="SECONDS", help="length (default: that of the excitation)")
     options.add_argument("--seed", type=int, default=0, help="of all noise and of what the excitation draws (default: 0)")
     options.add_argument("--out", type=Path, metavar="BAG", help="folder to make; one that exists is left as it is")
@@ -129,7 +129,7 @@ def run(options: argparse.Namespace) -> None:
     added = [effect for given in options.physics for effect in added_physics(given, nominal.caster_names)]
     robot = dataclasses.replace(nominal, physics=(*nominal.physics, *added))
     believed = dataclasses.replace(nominal, physics=())
-    excitation = make_excitation(options.excite, believed, options.duration, options.seed)
+    excitation = read_excitation(options.excite, believed, options.duration, options.seed)
     controller = options.controller or ("velocity_loops" if excitation.lifted else "computed_torque")
     if excitation.lifted and controller != "velocity_loops":
         raise DescriptionError("controller", controller, f"allowed: velocity_loops with {options.excite}, off the ground")

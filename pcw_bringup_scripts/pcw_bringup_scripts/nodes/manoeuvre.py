@@ -15,7 +15,7 @@ from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
-from pcw_control.excitation import EXCITATIONS, make_excitation
+from pcw_control.excitation import EXCITATIONS, read_excitation
 from pcw_description.errors import PcwError
 from pcw_description.nodes.node_tools import COMMAND_SOURCE, SENSOR, declare, run_node, stamp_to_ns
 from pcw_description.robot_file import load_robot
@@ -33,7 +33,10 @@ class ManoeuvreNode(Node):
 
     def __init__(self) -> None:
         super().__init__("manoeuvre")
-        name = declare(self, "manoeuvre", "identification", "which one", read_only=True, choices=tuple(EXCITATIONS))
+        name = declare(
+            self, "manoeuvre", "identification", f"which one: {', '.join(EXCITATIONS)}; or a file from mismatch suggest",
+            read_only=True,
+        )
         robot = declare(self, "robot", "thesis", "to measure for whom: robot file, or shipped robot", read_only=True)
         seed = declare(self, "seed", 0, "of what the manoeuvre draws", range=(0, 2**31 - 1), read_only=True)
         duration = declare(self, "duration", 0.0, "length; 0 is its own", "s", (0.0, 3600.0), read_only=True)
@@ -42,7 +45,7 @@ class ManoeuvreNode(Node):
         self._patience = declare(
             self, "patience", 60.0, "give up after so long in vain, real time", "s", (1.0, 3600.0), read_only=True
         )
-        self._manoeuvre = make_excitation(name, load_robot(robot), duration or None, seed)
+        self._manoeuvre = read_excitation(name, load_robot(robot), duration or None, seed)
         self._period_ns = round(1e9 / rate)
         self._start_ns: int | None = None
         self._next_ns = 0

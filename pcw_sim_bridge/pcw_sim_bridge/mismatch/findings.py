@@ -17,13 +17,19 @@ VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insu
 
 @dataclasses.dataclass(frozen=True)
 class InputFinding:
-    """A recording that went in. `role` is "fit" or "holdout"."""
+    """A recording that went in.
+
+    Attributes:
+        role: "fit" or "holdout".
+        started: stamp of its first sample [s] on the clock of its headers; None where the file has no such clock.
+    """
 
     path: str
     sha256: str
     duration: float
     role: str
     warnings: tuple[str, ...]
+    started: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)

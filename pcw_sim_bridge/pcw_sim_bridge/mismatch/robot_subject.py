@@ -63,7 +63,9 @@ class RobotSubject:
                 f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
                 "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
             )
-        return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings)))
+        started = recording.t0_ns * 1e-9
+        finding = InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings), started)
+        return Opened(recording, finding)
 
     def _seen_robot(self) -> RobotDescription:
         """The robot as far as its recordings hold it."""
