@@ -9,7 +9,7 @@ from ..errors import MismatchError
 
 # Not in package.xml: rosdep does not know all of them, and nobody who analyses recordings needs them.
 MODULES = ("pysindy", "sklearn", "mujoco.sysid")
-HOW_TO_INSTALL = "pip install -r pcw_bringup_scripts/requirements/baselines.txt"
+HOW_TO_INSTALL = "python -m pip install -r pcw_bringup_scripts/requirements/baselines.txt"
 
 
 def comparison_module(name: str) -> Any:

@@ -80,9 +80,9 @@ def _free(axis: AxisDescription, builder: AxisProblemBuilder) -> list[tuple[Free
     known = tolerance("inertia", axis.inertia)
     free: list[tuple[FreeNumber, Writer]] = [
         (FreeNumber("inertia", axis.inertia, known, 0.2 * axis.inertia, 5.0 * axis.inertia, known), inertia),
-        # Off their bounds a little, as the toolbox asks for.
-        (FreeNumber(f"drive_coulomb_friction/{TARGET}", 0.1 * size, size, 0.0, 20.0 * size), coulomb),
-        (FreeNumber(f"drive_viscous_friction/{TARGET}", 0.1 * damping, damping, 0.0, 20.0 * damping), viscous),
+        # A twentieth of the range off the bound, where the toolbox's authors say that it stalls.
+        (FreeNumber(f"drive_coulomb_friction/{TARGET}", 0.0, size, 0.0, 20.0 * size, start=size), coulomb),
+        (FreeNumber(f"drive_viscous_friction/{TARGET}", 0.0, damping, 0.0, 20.0 * damping, start=damping), viscous),
         (FreeNumber(f"constant_load/{TARGET}", 0.0, size, -20.0 * size, 20.0 * size), load),
     ]
     if axis.gravity_arm is not None:

@@ -38,7 +38,7 @@ from .mujoco_identification import (
     spread_out,
 )
 
-STEP = 1e-3  # [s]
+STEP = 2e-3  # [s]; the tyres and springs of this package stay stable up to 5 ms
 FRICTIONS = {
     "drive_coulomb_friction": "coulomb",
     "drive_viscous_friction": "viscous",
@@ -55,8 +55,13 @@ def identified_robot(
     held_out: Sequence[Recording],
     proof: RegressionProblem,
     seconds: float,
+    numbers: Sequence[FreeNumber] | None = None,
 ) -> Explained:
     """Fit a robot's numbers to its recordings within about so many seconds.
+
+    Args:
+        proof: problem of the held-out recordings.
+        numbers: to free; default: all.
 
     Raises:
         MismatchError: there are no torques to drive the simulation with, or the robot cannot be simulated.
@@ -64,7 +69,7 @@ def identified_robot(
     builder = RobotProblemBuilder(robot, recordings)
     if not builder.balanced:
         raise MismatchError("could not run: it needs recorded torques, and casters with an offset")
-    numbers = free_numbers(robot)
+    numbers = free_numbers(robot) if numbers is None else numbers
     simulation = PlantRollout(robot, numbers)
     windows = _windows(robot, builder, simulation, seconds, len(numbers))
     found = identify(simulation.spec, windows, numbers, rollout=simulation)
@@ -105,8 +110,8 @@ def free_numbers(robot: RobotDescription) -> list[FreeNumber]:
             free("torque_constant", f"torque_constant/{caster.name}_{axis}", 1.0, 0.5)
         for effect, parameter in FRICTIONS.items():
             typical = get(effect).parameter(parameter).typical
-            # Off its bound a little, as the toolbox asks for.
-            found.append(FreeNumber(f"{effect}/{caster.name}", 0.01 * typical, typical, 0.0, 20.0 * typical))
+            # A twentieth of the range off the bound, where the toolbox's authors say that it stalls.
+            found.append(FreeNumber(f"{effect}/{caster.name}", 0.0, typical, 0.0, 4.0 * typical, start=0.2 * typical))
     return found
 
 
@@ -230,13 +235,16 @@ class PlantRollout:
         for model, control, initial, parameters in zip(models, control_signal, initial_states, param_dicts, strict=True):
             predicted = self._simulate(control.times, control.data, initial, parameters.as_vector())
             times = control.times[1:]
+            # Only its first column, the time, is read where the sensors tell all.
+            state = np.zeros((len(times), len(initial)))
+            state[:, 0] = times
             trajectories.append(
                 sysid.SystemTrajectory(
                     model=model,
                     control=control,
                     sensordata=sysid.TimeSeries(times, predicted, rollout_signal_mapping),
                     initial_state=initial,
-                    state=sysid.TimeSeries(times, np.zeros((len(times), len(initial))), rollout_state_mapping),
+                    state=sysid.TimeSeries(times, state, rollout_state_mapping),
                 )
             )
         return trajectories

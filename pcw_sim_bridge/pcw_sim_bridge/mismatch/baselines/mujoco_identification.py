@@ -36,6 +36,7 @@ class FreeNumber:
         nominal: value of the description; lower and upper bound it.
         size: tolerance, or a typical size where it has none.
         tolerance: 0 where it has none.
+        start: where the search begins; None is at the nominal value.
     """
 
     name: str
@@ -44,6 +45,7 @@ class FreeNumber:
     lower: float
     upper: float
     tolerance: float = 0.0
+    start: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +97,8 @@ def identify(
         low, high = ((bound - number.nominal) / number.size for bound in (number.lower, number.upper))
         write = _writer(number, modifiers[k]) if modifiers else None
         parameters.add(sysid.Parameter(number.name, 0.0, low, high, modifier=write))
+        if number.start is not None:
+            parameters[number.name].value[:] = (number.start - number.nominal) / number.size
     sequences = sysid.ModelSequences(
         "recordings",
         spec,

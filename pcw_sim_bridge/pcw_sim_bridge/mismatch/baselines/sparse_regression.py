@@ -1,9 +1,10 @@
 """PySINDy on the residual: sequentially thresholded least squares over a library of candidate columns.
 
 Used as its documentation advises: normalised columns, and a median over twenty bootstrap models. Columns and target have
-unit rms, so that a threshold of 0.1 keeps what makes a tenth of the residual and more. The ridge is the one that predicts
-left-out blocks of the recordings best; where none predicts them better than zero does, nothing is kept. Without this the
-many columns that run alike on a robot get large weights of opposite signs, and the prediction is worth nothing.
+unit rms, so that a threshold of 0.1 keeps what makes a tenth of the residual and more. The ridge, and whether the kept
+terms are fitted again without it, are what predicts left-out blocks of the recordings best; where nothing predicts them
+better than zero does, nothing is kept. Without this the many columns that run alike on a robot get large weights of opposite
+signs, and the prediction is worth nothing.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from .comparison_packages import comparison_module
 # PySINDy's own default, and one that keeps only what nobody would overlook.
 THRESHOLDS = (0.1, 0.3)
 BOOTSTRAP_MODELS = 20
-# Offered per sample.
-RIDGES = (1e-4, 1e-3, 1e-2, 1e-1)
+# Ridge per sample, and whether the kept terms are fitted again without it.
+Tuning = tuple[float, bool]
+TUNINGS: tuple[Tuning, ...] = tuple((ridge, again) for ridge in (1e-4, 1e-2, 1e-1) for again in (True, False))
 BLOCKS = 5
 # A number of the description is re-tuned, not named, as far as this many of its tolerances.
 TOLERANCES = 3.0
@@ -70,7 +72,7 @@ def sparse_weights(columns: FloatArray, target: FloatArray, block: IntArray, thr
     """Weights (K,) of columns (T, K) that explain a target (T,), most of them exactly zero.
 
     Args:
-        block: contiguous block of each row (T,), for the choice of the ridge.
+        block: contiguous block of each row (T,), for the tuning.
         threshold: least weight between columns and target of unit rms.
         seed: of the bootstrap.
     """
@@ -88,32 +90,33 @@ def sparse_weights(columns: FloatArray, target: FloatArray, block: IntArray, thr
         with warnings.catch_warnings():
             # It warns of every model that keeps nothing, which is an answer here.
             warnings.simplefilter("ignore")
-            ridge = _best_ridge(scaled, aim, block, threshold)
-            if ridge is not None:
-                weights[used] = _fit(scaled, aim, threshold, ridge, BOOTSTRAP_MODELS) * spread / size[used]
+            tuning = _best_tuning(scaled, aim, block, threshold)
+            if tuning is not None:
+                weights[used] = _fit(scaled, aim, threshold, tuning, BOOTSTRAP_MODELS) * spread / size[used]
     finally:
         np.random.set_state(state)
     return weights
 
 
-def _best_ridge(columns: FloatArray, target: FloatArray, block: IntArray, threshold: float) -> float | None:
-    """The ridge that predicts left-out blocks best, None where zero does."""
-    errors = dict.fromkeys(RIDGES, 0.0)
+def _best_tuning(columns: FloatArray, target: FloatArray, block: IntArray, threshold: float) -> Tuning | None:
+    """The tuning that predicts left-out blocks best, None where zero does."""
+    errors = dict.fromkeys(TUNINGS, 0.0)
     for label in np.unique(block):
         out = block == label
         if out.all():
             return None
-        for ridge in RIDGES:
-            weights = _fit(columns[~out], target[~out], threshold, ridge, 1)
-            errors[ridge] += float(np.sum((target[out] - columns[out] @ weights) ** 2))
-    best = min(errors, key=lambda ridge: errors[ridge])
+        for tuning in TUNINGS:
+            weights = _fit(columns[~out], target[~out], threshold, tuning, 1)
+            errors[tuning] += float(np.sum((target[out] - columns[out] @ weights) ** 2))
+    best = min(errors, key=lambda tuning: errors[tuning])
     return best if errors[best] < float(np.sum(target**2)) else None
 
 
-def _fit(columns: FloatArray, target: FloatArray, threshold: float, ridge: float, models: int) -> FloatArray:
+def _fit(columns: FloatArray, target: FloatArray, threshold: float, tuning: Tuning, models: int) -> FloatArray:
     """Weights (K,) by PySINDy, the median over bootstrap models where there are several."""
     pysindy = comparison_module("pysindy")
-    optimizer = pysindy.STLSQ(threshold=threshold, alpha=ridge * len(target), unbias=False)
+    ridge, again = tuning
+    optimizer = pysindy.STLSQ(threshold=threshold, alpha=ridge * len(target), unbias=again)
     if models > 1:
         optimizer = pysindy.EnsembleOptimizer(optimizer, bagging=True, n_models=models)
     model = pysindy.SINDy(optimizer=optimizer, feature_library=pysindy.IdentityLibrary())
