@@ -3,14 +3,16 @@
 import dataclasses
 import importlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pcw_sim_bridge
 from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
-from pcw_description.axis_recording import AxisDescription, parse_axis_description
+from pcw_description.axis_recording import AxisDescription, load_axis_description, parse_axis_description
 from pcw_description.effects.registry import read_physics
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
@@ -23,7 +25,14 @@ from pcw_sim_bridge.mismatch.baselines.candidate_columns import (
     variable_columns,
 )
 from pcw_sim_bridge.mismatch.baselines.identified_robot import free_numbers, identified_robot, with_numbers
-from pcw_sim_bridge.mismatch.baselines.null_table import MARK, NullCase, healthy_robot, table, wilson_interval, write
+from pcw_sim_bridge.mismatch.baselines.null_table import (
+    MARK,
+    NullCase,
+    healthy_robot,
+    table,
+    wilson_interval,
+    write,
+)
 from pcw_sim_bridge.mismatch.baselines.sparse_regression import by_effects, by_variables, sparse_weights
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -69,6 +78,19 @@ def axis() -> AxisDescription:
     return parse_axis_description(SLED)
 
 
+def data_folders() -> list[Path]:
+    """Folders that may hold the real recordings."""
+    named = [Path(os.environ["PCW_DATA"])] if "PCW_DATA" in os.environ else []
+    return named + [parent / "shared" / "data" for parent in (*Path.cwd().parents, *Path(__file__).parents)]
+
+
+def axis_file(name: str) -> Path:
+    """Return a shipped axis description, in the source tree or in an installation."""
+    module = Path(pcw_sim_bridge.__file__).resolve()
+    places = [module.parents[1] / "config", module.parents[4] / "share" / "pcw_sim_bridge" / "config"]
+    return next(place / "axes" / name for place in places if (place / "axes" / name).exists())
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two runs of a robot with dry friction in one drive, along different paths."""
@@ -97,6 +119,25 @@ def test_every_method_finds_the_dry_friction_of_a_sled(tmp_path: Path) -> None:
     for name in ("PySINDy 0.3, variables", "PySINDy 0.3, effect columns", "mujoco.sysid"):
         assert "drive_coulomb_friction/axis" in results[name].names
     assert "axis_force: velocity" in results["gradient boosting"].names
+
+
+@pytest.mark.usefixtures("packages")
+def test_on_a_real_drive_they_find_what_was_published() -> None:
+    """EMPS (Janot, Gautier, Brunot 2019): viscous and Coulomb friction and an offset; held out with force pulses."""
+    data = next((place for place in data_folders() if (place / "emps" / "DATA_EMPS.mat").exists()), None)
+    if data is None:
+        pytest.skip("the EMPS recordings are not here; set PCW_DATA to the folder that holds emps/DATA_EMPS.mat")
+    described = load_axis_description(axis_file("emps.yaml"))
+    fit, holdout = data / "emps" / "DATA_EMPS.mat", data / "emps" / "DATA_EMPS_PULSES.mat"
+    results = {result.name: result for result in run_baselines(described, [fit], [holdout])}
+    for result in results.values():
+        assert result.inverse_nrmse is not None, result.remark
+        errors = " -> ".join(f"{error:.4f}" for error in result.inverse_nrmse)
+        print(f"{result.name}: {', '.join(result.names)}; {errors}; {result.seconds:.1f} s; {result.remark}")
+        assert result.inverse_nrmse[1] < 0.1
+    both = {"drive_viscous_friction/axis", "drive_coulomb_friction/axis"}
+    assert both <= set(results["PySINDy 0.3, variables"].names)
+    assert {*both, "constant_load/axis"} == set(results["mujoco.sysid"].names)
 
 
 @pytest.mark.usefixtures("packages")
@@ -197,10 +238,8 @@ def test_numbers_of_the_description_read_as_effects() -> None:
 def test_freed_numbers_go_into_the_robot() -> None:
     same = with_numbers(THESIS, {number.name: number.nominal for number in free_numbers(THESIS)})
     assert dataclasses.replace(same, physics=()) == dataclasses.replace(THESIS, physics=())
-    changed = with_numbers(
-        THESIS,
-        {"chassis.mass": 80.0, "wheel_radius/rear_left": 0.07, "module.inertia_zz": 0.013, "torque_constant/rear_left_steer": 1.1},
-    )
+    values = {"chassis.mass": 80.0, "wheel_radius/rear_left": 0.07, "module.inertia_zz": 0.013}
+    changed = with_numbers(THESIS, values | {"torque_constant/rear_left_steer": 1.1})
     assert changed.chassis.mass == 80.0
     assert changed.casters[THESIS.caster_index("rear_left")].wheel_radius == 0.07
     assert [caster.module.inertia_zz for caster in changed.casters] == pytest.approx([0.013] * 4)

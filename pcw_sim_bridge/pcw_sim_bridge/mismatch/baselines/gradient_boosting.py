@@ -75,8 +75,8 @@ def _choose(
 def _decoys(table: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Every variable moved round by a quarter to three quarters of the samples, (T, K)."""
     count = len(table)
-    shifts = rng.integers(count // 4, max(3 * count // 4, count // 4 + 1), table.shape[1])
-    moved: FloatArray = np.stack([np.roll(table[:, k], shift) for k, shift in enumerate(shifts)], axis=1)
+    columns = [np.roll(column, int(rng.integers(count // 4, 3 * count // 4 + 1))) for column in table.T]
+    moved: FloatArray = np.stack(columns, axis=1)
     return moved
 
 

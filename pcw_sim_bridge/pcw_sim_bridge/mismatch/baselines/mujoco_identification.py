@@ -155,5 +155,5 @@ def _writer(number: FreeNumber, modifier: Callable[[Any, float], None]) -> Calla
 def spread_out(pieces: Sequence[tuple[int, int]], length: int, count: int) -> list[tuple[int, int]]:
     """Choose windows: up to `count` of (piece, start), evenly over pieces (index, samples) without overlap."""
     starts = [(piece, start) for piece, samples in pieces for start in range(0, samples - length, length)]
-    chosen = np.unique(np.linspace(0, len(starts) - 1, min(count, len(starts))).astype(int)) if starts else []
-    return [starts[k] for k in chosen]
+    places = np.unique(np.linspace(0, len(starts) - 1, min(count, len(starts))).astype(int)).tolist() if starts else []
+    return [starts[k] for k in places]

@@ -3,7 +3,8 @@
     python -m pcw_sim_bridge.mismatch.baselines.null_table --cases 40 --seed 1 --out pcw_sim_bridge/docs/baselines.md
 
 Draws robots within the tolerances of shipped descriptions and drives each twice: along the excitation that tells effects
-apart best, for every method to learn from, and between random goals, to be judged by. The table replaces whatever follows the mark in the file.
+apart best, for every method to learn from, and between random goals, to be judged by. The table replaces whatever follows
+the mark in the file.
 """
 
 from __future__ import annotations
@@ -163,8 +164,9 @@ def main(arguments: Sequence[str] | None = None, say: Callable[[str], None] = pr
             cases.append(case)
             say(f"{robot}, seed {seed}: " + "; ".join(f"{r.name}: {len(r.names)}" for r in case.results))
             how = (
-                f"{len(cases)} healthy robots ({', '.join(ROBOTS)} in turn, seeds {options.seed} to {seed}), each number drawn "
-                f"within its tolerance, `reduced` plant, recordings of {options.duration:g} s: `identification` to learn from, `random_goals` held out."
+                f"{len(cases)} healthy robots ({', '.join(ROBOTS)} in turn, seeds {options.seed} to {seed}), each number "
+                f"drawn within its tolerance, `reduced` plant, recordings of {options.duration:g} s: `identification` to "
+                "learn from, `random_goals` held out."
             )
             write(options.out, cases, how)
     except PcwError as error:
