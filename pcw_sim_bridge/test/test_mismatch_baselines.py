@@ -24,6 +24,7 @@ from pcw_sim_bridge.mismatch.baselines.candidate_columns import (
     number_as_effect,
     variable_columns,
 )
+from pcw_sim_bridge.mismatch.baselines.identified_axis import axis_spec
 from pcw_sim_bridge.mismatch.baselines.identified_robot import free_numbers, identified_robot, with_numbers
 from pcw_sim_bridge.mismatch.baselines.null_table import (
     MARK,
@@ -150,6 +151,29 @@ def test_the_error_before_is_the_analysers_own(tmp_path: Path) -> None:
     assert [result.inverse_nrmse[0] for result in results if result.inverse_nrmse] == pytest.approx(
         [findings.fit.inverse_nrmse[0]] * 5, rel=1e-12
     )
+
+
+def test_the_joint_given_to_mujoco_is_the_axis_of_the_description() -> None:
+    """Its acceleration is (force - moment sin(q - hanging)) / inertia, and -friction / inertia where it coasts."""
+    mujoco = pytest.importorskip("mujoco")
+    arm = {"gravity_arm": {"moment": 2.0, "hanging_position": 0.4}, "kind": "rotary", "inertia": 0.05}
+    for described in (axis(), parse_axis_description(SLED | {"kind": "rotary"}), parse_axis_description(SLED | arm)):
+        moment = described.gravity_arm.moment if described.gravity_arm else 0.0
+        spec = axis_spec(described, 1e-3)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        for position, force in ((0.0, 0.0), (1.1, 0.3), (-2.0, -0.7)):
+            data.qpos[0], data.qvel[0], data.ctrl[0] = position, 0.0, force
+            mujoco.mj_forward(model, data)
+            expected = (force - moment * np.sin(position - 0.4)) / described.inertia
+            # The arm's own mass is a hundredth of the inertia, and MuJoCo bounds inertias from below.
+            assert data.qacc[0] == pytest.approx(expected, rel=1e-3, abs=1e-9)
+        spec.joint("axis").frictionloss = 0.5
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qpos[0], data.qvel[0] = 0.4, 1.0
+        mujoco.mj_forward(model, data)
+        assert data.qacc[0] == pytest.approx(-0.5 / described.inertia, rel=1e-3)
 
 
 @pytest.mark.usefixtures("packages")

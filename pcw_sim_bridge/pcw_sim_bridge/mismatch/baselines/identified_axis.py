@@ -44,7 +44,7 @@ def identified_axis(
     builder = AxisProblemBuilder(axis, recordings)
     smoothing = builder.choose_smoothing()
     free = _free(axis, builder)
-    model = _axis_spec(axis, 1.0 / builder.filters[0].rate)
+    model = axis_spec(axis, 1.0 / builder.filters[0].rate)
     found = identify(model, _windows(builder), [number for number, _ in free], modifiers=[write for _, write in free])
     patched = _with_numbers(axis, found.values, smoothing)
     after = AxisProblemBuilder(patched, held_out, builder.cutoff).build(smoothing).residual
@@ -108,7 +108,7 @@ def _give_inertia(body: Any, axis: AxisDescription, inertia: float) -> None:
             body.mass = inertia
 
 
-def _axis_spec(axis: AxisDescription, step: float) -> Any:
+def axis_spec(axis: AxisDescription, step: float) -> Any:
     """MjSpec of one joint with a motor."""
     import mujoco
 

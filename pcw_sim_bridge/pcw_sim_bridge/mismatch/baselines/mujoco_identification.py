@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import MismatchError
 from ..regression_problem import FloatArray
 from .comparison_packages import comparison_module
 
@@ -22,8 +23,10 @@ ITERATIONS = 6
 # Step of the finite differences, in sizes of a number: far above rounding, far below what matters.
 DIFFERENCE = 1e-2
 SIGNIFICANCE = 3.0
+# A sensor counts as moving by this part of what the liveliest one does, at least.
+SMALLEST_SCALE = 0.02
 WINDOW = 1.0  # [s]
-AXIS_WINDOWS = 12
+AXIS_WINDOWS = 24
 FEWEST_WINDOWS, MOST_WINDOWS = 4, 40
 
 
@@ -88,6 +91,9 @@ def identify(
         rollout: replaces MuJoCo's own simulation (`custom_rollout` of the toolbox). Without it the sensors are those of
             the whole state, in its order.
         modifiers: per number what writes its value into a spec; not needed with a rollout of one's own.
+
+    Raises:
+        MismatchError: the toolbox gave up.
     """
     sysid = comparison_module("mujoco.sysid")
     model = spec.compile()
@@ -108,7 +114,9 @@ def identify(
         [sysid.TimeSeries.from_names(window.time, window.sensed, model) for window in windows],
     )
     everything = np.concatenate([window.sensed - window.sensed[0] for window in windows])
-    scale = np.maximum(np.sqrt(np.mean(everything**2, axis=0)), 1e-12)
+    scale = np.sqrt(np.mean(everything**2, axis=0))
+    # A joint that hardly moves must not weigh most.
+    scale = np.maximum(scale, SMALLEST_SCALE * np.max(scale))
 
     def difference(
         parameters: Any, predicted: Any, measured: Any, model: Any, return_all: bool, state: FloatArray, **ignored: Any
@@ -122,19 +130,22 @@ def identify(
     residual = sysid.build_residual_fn(
         models_sequences=[sequences], modify_residual=difference, resample_true=False, n_threads=1, **options
     )
-    fitted, result = sysid.optimize(
-        parameters, residual, optimizer="mujoco", verbose=False, max_iters=ITERATIONS, x_scale="jac", eps=DIFFERENCE,
-        output=io.StringIO(),  # prints every iteration otherwise
-    )
-    best = fitted.as_vector()
-    left = [np.ravel(piece) for piece in residual(best, fitted)[0]]
-    _, half = sysid.calculate_intervals(left, np.asarray(result.jac))
+    try:
+        fitted, result = sysid.optimize(
+            parameters, residual, optimizer="mujoco", verbose=False, max_iters=ITERATIONS, x_scale="jac", eps=DIFFERENCE,
+            output=io.StringIO(),  # prints every iteration otherwise
+        )
+        best = fitted.as_vector()
+        left = [np.ravel(piece) for piece in residual(best, fitted)[0]]
+        _, half = sysid.calculate_intervals(left, np.asarray(result.jac))
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        raise MismatchError(f"could not run: the toolbox gave up ({error})") from error
     values, moved, undetermined = {}, [], 0
     for number, change, interval in zip(numbers, best, half, strict=True):
         values[number.name] = number.nominal + float(change) * number.size
-        error = float(interval) / 1.96 * number.size
-        undetermined += not np.isfinite(error)
-        if abs(float(change)) * number.size > SIGNIFICANCE * max(error, number.tolerance):
+        deviation = float(interval) / 1.96 * number.size
+        undetermined += not np.isfinite(deviation)
+        if abs(float(change)) * number.size > SIGNIFICANCE * max(deviation, number.tolerance):
             moved.append(number.name)
     start = float(np.mean(np.concatenate([np.ravel(p) for p in residual(np.zeros(len(best)), fitted)[0]]) ** 2))
     end = float(np.mean(np.concatenate(left) ** 2))
