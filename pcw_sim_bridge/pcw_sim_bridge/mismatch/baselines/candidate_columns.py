@@ -152,6 +152,8 @@ def features(problem: RegressionProblem) -> dict[str, FloatArray]:
             found[f"cos({name})"], found[f"sin({name})"] = np.cos(values), np.sin(values)
         elif name != "time":
             found[name] = values
+        if name == "position":
+            found["position within a turn"] = np.mod(values, 2.0 * np.pi)
         if "velocity" in name or name in ("v_x", "v_y", "omega"):
             found[f"d/dt {name}"] = rate_of(problem, values)
     return found
