@@ -201,4 +201,4 @@ class RowReader:
             shift = float(np.mean(np.interp(stamps[common], known_stamps, known) - motion.yaw[common]))
         else:
             shift = float(known[-1] - motion.yaw[0])
-        return dataclasses.replace(motion, yaw=motion.yaw + shift)
+        return dataclasses.replace(motion, pose=motion.pose + [0.0, 0.0, shift])

@@ -18,10 +18,12 @@ from scipy import linalg
 
 from pcw_description.robot_description import AXIS_NAMES
 
+from .channel_differences import ChannelDifferences
 from .live_rows import Window
 from .live_tuning import Tuning
 from .regression_problem import BoolArray, FloatArray
-from .robot_channels import STILL_SPEED, WRENCH
+from .robot_channels import STILL_SPEED
+from .rolling_model import WRENCH
 
 ALL_CASTERS = "all casters"
 # A place is told if its best cause accounts for at least this part, and every other place leaves so many times as much.
@@ -141,28 +143,27 @@ def _causes(tuning: Tuning, window: Window) -> Iterator[_Cause]:
         push = np.zeros((len(rows), len(layout.channels), len(wrench)))
         push[:, wrench, range(len(wrench))] = 1.0
         yield _Cause("chassis", "force or push", push)
-    if window.builder.balanced:
+    builder = window.builder
+    if builder.balanced:
+        differences = ChannelDifferences(builder.model, builder.motions, builder.filters)
         for column_of_axis, axis_name in enumerate(AXIS_NAMES):
-            each = [_friction_column(tuning, window, i, column_of_axis) for i in range(robot.n)]
+            each = [_friction_column(tuning, window, differences, i, column_of_axis) for i in range(robot.n)]
             cause = f"friction in the {'drive' if axis_name == 'drive' else 'steering'}"
             for name, column in zip(robot.caster_names, each, strict=True):
                 yield _Cause(name, cause, column)
             yield _Cause(ALL_CASTERS, cause, np.asarray(sum(each)))
 
 
-def _friction_column(tuning: Tuning, window: Window, caster: int, axis: int) -> FloatArray:
+def _friction_column(
+    tuning: Tuning, window: Window, differences: ChannelDifferences, caster: int, axis: int
+) -> FloatArray:
     """What a torque against the motion of one joint adds to the residual, (T, C, 1)."""
-    builder = window.builder
-    pieces = []
-    # Small against the weight, so that the tyres' curves stay straight.
-    step = 1e-2 * builder.robot.total_mass * float(np.mean(builder.numbers.radius))
-    for motion, filter_ in zip(builder.motions, builder.filters, strict=True):
+    torques = []
+    for motion in differences.motions:
         torque = np.zeros_like(motion.torque)
-        torque[:, caster, axis] = -step * np.tanh(motion.velocity[:, caster, axis] / STILL_SPEED)
-        plain, changed = builder.model.sides(motion), builder.model.sides(motion, added_torque=torque)
-        difference = ((plain[0] - plain[1]) - (changed[0] - changed[1])) / step
-        pieces.append(filter_.apply(np.nan_to_num(difference)))
-    column = np.concatenate(pieces)[-len(window.rows) :]
+        torque[:, caster, axis] = -np.tanh(motion.velocity[:, caster, axis] / STILL_SPEED)
+        torques.append(torque)
+    column = differences.of_torque(torques)[-len(window.rows) :]
     rows = dataclasses.replace(window.rows, residual=column)
     arranged, _ = tuning.layout.arranged(window.layout, rows)
     return arranged.residual[:, :, None]

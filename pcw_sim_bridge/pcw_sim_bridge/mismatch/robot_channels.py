@@ -72,6 +72,11 @@ class RobotProblemBuilder:
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
         self.model = ChannelModel(described, self.numbers, self.layout)
 
+    @property
+    def balanced(self) -> bool:
+        """Whether there are channels of forces: torques were recorded, of casters with an offset."""
+        return self.layout.balanced
+
     def channels(self) -> tuple[Channel, ...]:
         """Channels that these recordings can fill."""
         return self.layout.channels()

@@ -54,6 +54,11 @@ class RobotMotion:
     pose: FloatArray
     tracked_twist: FloatArray
 
+    @property
+    def yaw(self) -> FloatArray:
+        """Yaw of base_link (T,) [rad]."""
+        return self.pose[:, 2]
+
 
 def read_motions(
     robot: RobotDescription, recording: Recording, index: int, cutoff: float, with_torque: bool

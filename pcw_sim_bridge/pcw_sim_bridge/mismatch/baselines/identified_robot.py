@@ -318,11 +318,10 @@ def _window(
 ) -> Window:
     rows = slice(start, start + length)
     numbers = builder.numbers
-    angle = np.ascontiguousarray(motion.position[rows, :, STEER])
-    twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity[rows])
+    twist, _ = twists(numbers, motion.position[rows, :, STEER], motion.velocity[rows])
     yaw = float(np.nan_to_num(motion.yaw[start]))
     state = simulation.state(yaw, twist[0], motion.position[start], motion.velocity[start])
-    size = len(angle)
+    size = len(twist)
     sensed = [motion.position[rows].reshape(size, -1), motion.velocity[rows].reshape(size, -1)]
     return Window(
         state, motion.time[rows] - motion.time[start], motion.torque[rows].reshape(size, -1), np.concatenate(sensed, axis=1)
