@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -13,8 +12,11 @@ from pcw_description.effect_instance import EffectInstance
 from .regression_problem import FloatArray
 from .robot_effects import ChannelModel, normal_along
 from .robot_motion import RobotMotion
-from .rolling_model import ModelNumbers
+from .rolling_model import ModelNumbers, rolling_state
 from .signal_filter import SignalFilter
+from .torque_response import TorqueResponse
+
+TORQUES_AT_ONCE = 64  # which the memory of a minute's recording holds easily
 
 
 class ChannelDifferences:
@@ -35,6 +37,7 @@ class ChannelDifferences:
         self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])
         self.predicted = self.filtered([predicted for _, predicted in self._sides])
         self.residual = self.measured - self.predicted
+        self._responses: list[TorqueResponse] | None = None
         self.normal = [normal_along(motion, model.numbers) for motion in motions]
 
     def filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
@@ -69,14 +72,24 @@ class ChannelDifferences:
         return self.filtered(pieces)
 
     def of_torque(self, torques: Sequence[FloatArray]) -> FloatArray:
-        """What torques (T, n, 2) [N m] on the joints, one array per motion, add to the residual, (T, C)."""
-        size = max(max(float(np.max(np.abs(torque))) for torque in torques), 1e-12)
-        # Small against the weight, so that the tyres' curves stay straight.
-        robot = self.model.robot
-        scale = 1e-2 * robot.total_mass * float(np.mean(self.model.numbers.radius)) / size
-        pieces = []
-        for motion, around, plain, torque in zip(self.motions, self._around, self._sides, torques, strict=True):
-            more = scale * torque if around.torque is None else around.torque + scale * torque
-            measured, predicted = self.model.sides(motion, dataclasses.replace(around, torque=more))
-            pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)) / scale)
-        return self.filtered(pieces)
+        """What torques on the joints add to the residual.
+
+        Args:
+            torques: one array (T, n, 2, K) [N m] per motion.
+
+        Returns:
+            (T, C, K), per unit of each of the K torques.
+        """
+        if self._responses is None:
+            self._responses = []
+            for motion, around in zip(self.motions, self._around, strict=True):
+                state = rolling_state(motion, self.model.numbers, self.model.layout, around)
+                self._responses.append(TorqueResponse(motion, self.model.numbers, self.model.layout, state))
+        parts = []
+        for start in range(0, torques[0].shape[3], TORQUES_AT_ONCE):
+            some = slice(start, start + TORQUES_AT_ONCE)
+            pairs = zip(self._responses, self.known, torques, strict=True)
+            parts.append(
+                self.filtered([np.where(known[:, :, None], -r.apply(t[..., some]), 0.0) for r, known, t in pairs])
+            )
+        return np.concatenate(parts, axis=2)

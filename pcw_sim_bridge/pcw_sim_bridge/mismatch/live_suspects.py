@@ -160,10 +160,10 @@ def _friction_column(
     """What a torque against the motion of one joint adds to the residual, (T, C, 1)."""
     torques = []
     for motion in differences.motions:
-        torque = np.zeros_like(motion.torque)
-        torque[:, caster, axis] = -np.tanh(motion.velocity[:, caster, axis] / STILL_SPEED)
+        torque = np.zeros((*motion.torque.shape, 1))
+        torque[:, caster, axis, 0] = -np.tanh(motion.velocity[:, caster, axis] / STILL_SPEED)
         torques.append(torque)
-    column = differences.of_torque(torques)[-len(window.rows) :]
+    column = differences.of_torque(torques)[-len(window.rows) :, :, 0]
     rows = dataclasses.replace(window.rows, residual=column)
     arranged, _ = tuning.layout.arranged(window.layout, rows)
     return arranged.residual[:, :, None]

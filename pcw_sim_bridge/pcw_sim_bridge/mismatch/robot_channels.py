@@ -174,10 +174,7 @@ class RobotProblemBuilder:
             wrench[:, : len(WRENCH)] = -forces[:, 2 * n :]
             found = differences.filtered(np.split(wrench, borders))
             torques = forces[:, : 2 * n].reshape(len(forces), n, 2, -1)
-            for k in range(torques.shape[3]):
-                if torques[..., k].any():
-                    found[:, :, k] += differences.of_torque(np.split(torques[..., k], borders))
-            return found
+            return found + differences.of_torque(np.split(torques, borders)) if torques.any() else found
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
         return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)

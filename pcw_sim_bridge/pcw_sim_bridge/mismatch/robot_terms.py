@@ -108,16 +108,15 @@ class _TermMaker:
         """Columns (T, C, P) of an effect at work on some casters with common parameters."""
         column = AXIS_NAMES.index(axis or effect.axis)
         casters = [self.robot.caster_index(name) for name in target]
-        torques: dict[str, list[FloatArray]] = {parameter.name: [] for parameter in effect.linear_parameters}
+        torques = []
         for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
-            for found in torques.values():
-                found.append(np.zeros(motion.position.shape))
+            found = np.zeros((*motion.position.shape, len(effect.linear_parameters)))
             for i in casters:
                 position, velocity, force = (s[:, i, column] for s in (motion.position, motion.velocity, motion.torque))
                 by_name = effect.regressor(position, velocity, force, normal[:, i], shape)
-                for name, values in by_name.items():
-                    torques[name][-1][:, i, column] = values
-        return np.stack([self.differences.of_torque(pieces) for pieces in torques.values()], axis=2)
+                found[:, i, column] = np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1)
+            torques.append(found)
+        return self.differences.of_torque(torques)
 
     def _speed_shapes(self, effect: JointTorqueEffect) -> tuple[dict[str, float], ...] | None:
         """Grid of an effect's shaping parameters, or None for effects whose search does not pay on a rolling robot."""

@@ -343,7 +343,7 @@ def _shared_forces(steer_axis, caster_offset, steer_angle, wrench):  # type: ign
 
 
 @compiled
-def _slip_ratios(tyres, softness, force, grip):  # type: ignore[no-untyped-def]
+def slip_ratios(tyres, softness, force, grip):  # type: ignore[no-untyped-def]
     """Steady slip ratios (T, n, 2) under forces (T, n, 2) [N] on wheels of load times friction factor grip (T, n) [N]."""
     ratio = np.empty_like(force)
     for t in range(len(force)):
@@ -372,23 +372,52 @@ def slips(
     numbers: ModelNumbers, rate: float, speed: FloatArray, force: FloatArray, grip: FloatArray
 ) -> FloatArray:
     """Slip velocities (T, n, 2) [m/s] of tyres under forces (T, n, 2), at rolling speeds and loads (T, n)."""
-    ratio = _slip_ratios(numbers.tyres, numbers.softness, force, grip)
+    ratio = slip_ratios(numbers.tyres, numbers.softness, force, grip)
     ratio = ratio - DAMPING_TIME * derivative(ratio, rate)
     result: FloatArray = speed[:, :, None] * ratio + numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
     return result
 
 
-def channel_sides(
-    motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
-) -> tuple[FloatArray, FloatArray]:
-    """Measured and predicted side of every channel at the motion's rate, (T, C) each.
+def inertial_wrench(
+    numbers: ModelNumbers, motion: RobotMotion, steer_angle: FloatArray, twist: FloatArray, twist_dot: FloatArray
+) -> FloatArray:
+    """Wrench (T, 3) that accelerates chassis and modules moving with a twist (T, 3)."""
+    steer_rate, steer_acceleration = (np.ascontiguousarray(a[:, :, STEER]) for a in (motion.velocity, motion.acceleration))
+    wrench: FloatArray = _inertial_wrench(
+        numbers.chassis, numbers.modules, numbers.steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
+    )
+    return wrench
 
-    Args:
-        motion: the motion.
-        numbers: of the model.
-        layout: which channels are wanted.
-        around: what else is at work.
+
+@dataclasses.dataclass(frozen=True)
+class RollingState:
+    """How the wheels of a robot roll along a motion, before their slip.
+
+    Attributes:
+        steer_angle, radius: true headings [rad] and rolling radii [m] (T, n).
+        velocity: joint rates that wheels of the described radius would have (T, n, 2).
+        twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
+        grip, speed: load times friction factor [N] and rolling speed [m/s] (T, n).
+        spin: torque of the ground on each wheel about the vertical (T, n) [N m].
+        force: contact forces in the wheel frames (T, n, 2) [N].
     """
+
+    steer_angle: FloatArray
+    radius: FloatArray
+    velocity: FloatArray
+    twist: FloatArray
+    twist_dot: FloatArray
+    contradiction: FloatArray
+    grip: FloatArray
+    speed: FloatArray
+    spin: FloatArray
+    force: FloatArray
+
+
+def rolling_state(
+    motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
+) -> RollingState:
+    """Return how the wheels roll along a motion, and the forces under them."""
     steer_angle = np.ascontiguousarray(motion.position[:, :, STEER]) + numbers.steer_zero
     geometry = numbers.steer_axis, numbers.caster_offset
     velocity, radius = motion.velocity, np.broadcast_to(numbers.radius, steer_angle.shape)
@@ -402,17 +431,7 @@ def channel_sides(
     normal = normal_forces(numbers, steer_angle, acceleration_of(twist, twist_dot))
     grip = np.maximum(normal if around.grip is None else normal * around.grip, 1.0)
     speed = np.abs(velocity[:, :, DRIVE] * numbers.radius)
-    turn_rate = velocity[:, :, STEER] + twist[:, 2:]
-    spin = _scrub(numbers.tyres, turn_rate, speed, grip)
-
-    def inertial_wrench() -> FloatArray:
-        wrench: FloatArray = _inertial_wrench(
-            numbers.chassis, numbers.modules, numbers.steer_axis, steer_angle,
-            np.ascontiguousarray(velocity[:, :, STEER]), np.ascontiguousarray(motion.acceleration[:, :, STEER]),
-            twist, twist_dot,
-        )  # fmt: skip
-        return wrench
-
+    spin = _scrub(numbers.tyres, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
     if layout.balanced:
         torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
         if around.torque is not None:
@@ -421,16 +440,33 @@ def channel_sides(
             numbers.modules, *geometry, radius, steer_angle, velocity, motion.acceleration, torque, spin, twist, twist_dot
         )
     else:
-        force = _shared_forces(*geometry, steer_angle, inertial_wrench())
-    slip = slips(numbers, motion.rate, speed, force, grip)
-    slip_twist, slip_contradiction = rigid_motions(numbers, steer_angle, slip)
-    twist = twist - slip_twist
+        force = _shared_forces(*geometry, steer_angle, inertial_wrench(numbers, motion, steer_angle, twist, twist_dot))
+    return RollingState(steer_angle, radius, velocity, twist, twist_dot, contradiction, grip, speed, spin, force)
+
+
+def channel_sides(
+    motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
+) -> tuple[FloatArray, FloatArray]:
+    """Measured and predicted side of every channel at the motion's rate, (T, C) each.
+
+    Args:
+        motion: the motion.
+        numbers: of the model.
+        layout: which channels are wanted.
+        around: what else is at work.
+    """
+    state = rolling_state(motion, numbers, layout, around)
+    slip = slips(numbers, motion.rate, state.speed, state.force, state.grip)
+    slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, slip)
+    twist = state.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)
     measured, predicted = [], []
     if layout.balanced:
-        measured.append(_wrench_of(*geometry, steer_angle, force, spin))
-        predicted.append(inertial_wrench())
-    measured.append(contradiction.reshape(len(twist), -1))
+        measured.append(
+            _wrench_of(numbers.steer_axis, numbers.caster_offset, state.steer_angle, state.force, state.spin)
+        )
+        predicted.append(inertial_wrench(numbers, motion, state.steer_angle, twist, twist_dot))
+    measured.append(state.contradiction.reshape(len(twist), -1))
     predicted.append(slip_contradiction.reshape(len(twist), -1))
     if layout.imu:
         x, y = numbers.imu_position

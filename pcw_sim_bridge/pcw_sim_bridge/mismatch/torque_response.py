@@ -1,0 +1,153 @@
+"""What torques on the joints add to a robot's channels, linear in the torques and without running the model again.
+
+Along one motion, with tau (T, n, 2) and the tyres' curves straight about the slips there are:
+
+    dF = G tau,  d lambda = S dF,  d eps = |V_w| (1 - T D) d lambda + L D (1 - T D) d lambda,  dV = -A^+ d eps
+
+D being the time derivative and T the tyre's damping time. Thousands of torques that nobody has a name for can be tried so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from pcw_description.compiled import compiled
+from pcw_description.contact.contact_model import DAMPING_TIME, LENGTH
+from pcw_description.differential_kinematics import rigid_motion_kernel, wheel_jacobian_kernel
+from pcw_description.robot_description import DRIVE, STEER
+
+from .regression_problem import FloatArray
+from .robot_motion import RobotMotion
+from .rolling_model import ChannelLayout, ModelNumbers, RollingState, inertial_wrench, slip_ratios
+from .signal_filter import derivative
+
+FORCE_STEP = 1e-3  # of the load on a wheel, by which the slope of its tyre's curve is taken
+
+
+class TorqueResponse:
+    """The response of the channels along one motion."""
+
+    def __init__(self, motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, state: RollingState) -> None:
+        """Linearise.
+
+        Args:
+            motion: a true motion.
+            numbers: of the model.
+            layout: which channels there are.
+            state: how the wheels roll along the motion.
+        """
+        self.layout = layout
+        count, n = state.force.shape[:2]
+        steer_angle, force, grip = state.steer_angle, state.force, state.grip
+        # Forces in the wheel frames per joint torque (n, 2, 2).
+        of_torque = np.zeros((n, 2, 2))
+        offset_x, offset_y = numbers.caster_offset[:, 0], numbers.caster_offset[:, 1]
+        of_torque[:, 0, DRIVE] = 1.0 / numbers.radius
+        of_torque[:, 1, DRIVE] = offset_y / offset_x / numbers.radius
+        of_torque[:, 1, STEER] = -1.0 / offset_x
+        plain = slip_ratios(numbers.tyres, numbers.softness, force, grip)
+        slopes = np.empty((count, n, 2, 2))
+        for axis in range(2):
+            changed = force.copy()
+            changed[:, :, axis] += FORCE_STEP * grip
+            slopes[:, :, :, axis] = (slip_ratios(numbers.tyres, numbers.softness, changed, grip) - plain) / (
+                FORCE_STEP * grip[:, :, None]
+            )
+        self._ratio_of_torque = slopes @ of_torque
+        self._derivative = _derivative_matrix(count, motion.rate)
+        damped = sparse.eye_array(count) - DAMPING_TIME * self._derivative
+        relaxing = self._derivative @ damped
+        self._slip_of_ratio = [
+            (sparse.diags_array(state.speed[:, i]) @ damped + numbers.tyres[i, LENGTH] * relaxing).tocsr() for i in range(n)
+        ]
+        geometry = numbers.steer_axis, numbers.caster_offset, steer_angle
+        jacobian, self._rigid = _rigid_maps(*geometry)
+        wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
+        self._wrench_of_torque = np.einsum("tcnf,nfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
+        self._inertia, self._turning = _inertia_slopes(numbers, motion, state)
+        self._imu_position, self._gyro_scale, self._twist = numbers.imu_position, numbers.gyro_scale, state.twist
+
+    def apply(self, torque: FloatArray) -> FloatArray:
+        """Return what torques (T, n, 2, K) [N m] change in measured minus predicted channels (T, C, K)."""
+        count, n, _, width = torque.shape
+        layout = self.layout
+        ratio = self._ratio_of_torque @ torque
+        slip = np.empty((count, n, 2, width))
+        for i, operator in enumerate(self._slip_of_ratio):
+            slip[:, i] = (operator @ ratio[:, i].reshape(count, -1)).reshape(count, 2, width)
+        rigid = self._rigid @ slip.reshape(count, 2 * n, width)
+        twist, contradiction = -rigid[:, :3], rigid[:, 3:]
+        twist_dot = (self._derivative @ twist.reshape(count, -1)).reshape(twist.shape)
+        found = np.empty((count, layout.tracked.stop, width))
+        found[:, :3] = self._wrench_of_torque @ torque.reshape(count, 2 * n, width)
+        found[:, :3] -= self._inertia @ twist_dot + self._turning @ twist
+        found[:, layout.consistency] = -contradiction
+        if layout.imu:
+            (x, y), omega = self._imu_position, self._twist[:, 2, None]
+            start = layout.inertial.start
+            vx, vy = self._twist[:, 0, None], self._twist[:, 1, None]
+            dvx, dvy, domega = twist[:, 0], twist[:, 1], twist[:, 2]
+            found[:, start] = -self._gyro_scale * domega
+            found[:, start + 1] = -(
+                twist_dot[:, 0] - omega * dvy - domega * vy - twist_dot[:, 2] * y - 2.0 * omega * domega * x
+            )
+            found[:, start + 2] = -(
+                twist_dot[:, 1] + omega * dvx + domega * vx + twist_dot[:, 2] * x - 2.0 * omega * domega * y
+            )
+        if layout.pose:
+            found[:, layout.tracked] = -twist
+        return found
+
+
+def _derivative_matrix(count: int, rate: float) -> sparse.csr_array:
+    """The derivative of `signal_filter` as a matrix (T, T)."""
+    band = min(count, 32)
+    small = derivative(np.eye(band), rate)
+    if count <= band:
+        return sparse.csr_array(small)
+    half = band // 2
+    inner = small[half]
+    reach = np.flatnonzero(inner)
+    offsets = reach - half
+    matrix = sparse.diags_array(
+        [np.full(count - abs(o), inner[r]) for o, r in zip(offsets, reach, strict=True)], offsets=offsets, shape=(count, count)
+    ).tolil()
+    edge = band // 4
+    matrix[:edge, :band] = small[:edge]
+    matrix[count - edge :, count - band :] = small[band - edge :]
+    return matrix.tocsr()
+
+
+@compiled
+def _rigid_maps(steer_axis, caster_offset, steer_angle):  # type: ignore[no-untyped-def]
+    """Jacobian A (T, 2n, 3), and the map of slips to twist A^+ and contradiction 1 - A A^+, (T, 2n + 3, 2n)."""
+    count, n = steer_angle.shape
+    jacobians = np.empty((count, 2 * n, 3))
+    maps = np.empty((count, 2 * n + 3, 2 * n))
+    unit = np.zeros((n, 2))
+    for t in range(count):
+        jacobians[t] = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle[t])
+        for k in range(2 * n):
+            unit[k // 2, k % 2] = 1.0
+            twist, contradiction, _ = rigid_motion_kernel(steer_axis, caster_offset, steer_angle[t], unit)
+            unit[k // 2, k % 2] = 0.0
+            maps[t, :3, k] = twist
+            for i in range(n):
+                maps[t, 3 + 2 * i, k] = contradiction[i, 0]
+                maps[t, 4 + 2 * i, k] = contradiction[i, 1]
+    return jacobians, maps
+
+
+def _inertia_slopes(numbers: ModelNumbers, motion: RobotMotion, state: RollingState) -> tuple[FloatArray, FloatArray]:
+    """Slopes of the inertial wrench over the twist's derivative and over the twist, (T, 3, 3) each."""
+    steer_angle, twist, twist_dot = state.steer_angle, state.twist, state.twist_dot
+    plain = inertial_wrench(numbers, motion, steer_angle, twist, twist_dot)
+    inertia, turning = np.empty((len(twist), 3, 3)), np.empty((len(twist), 3, 3))
+    step = 1e-3
+    for k in range(3):
+        change = np.zeros(3)
+        change[k] = step
+        inertia[:, :, k] = (inertial_wrench(numbers, motion, steer_angle, twist, twist_dot + change) - plain) / step
+        turning[:, :, k] = (inertial_wrench(numbers, motion, steer_angle, twist + change, twist_dot) - plain) / step
+    return inertia, turning
