@@ -67,6 +67,7 @@ class LinearParameter:
         refinement: zero unless there is evidence for it; not part of the effect when it is first named.
         origin: value of the parameter where the coefficient is zero.
         reciprocal: the coefficient is the inverse of the parameter.
+        hidden: it is no number of the effect, only of how much of it there is.
     """
 
     name: str
@@ -77,6 +78,7 @@ class LinearParameter:
     refinement: bool = False
     origin: float = 0.0
     reciprocal: bool = False
+    hidden: bool = False
 
     def value(self, coefficient: float) -> float:
         """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""

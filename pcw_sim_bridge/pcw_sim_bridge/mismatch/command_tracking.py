@@ -1,0 +1,234 @@
+"""What happens between a torque command and the motor's torque: one small problem per joint, `command_tracking/<joint>`.
+
+The command that a joint held at each sample goes through the joint's limit and, for a candidate, through the effect's own
+kernel, step by step as in a simulator; what the drive reports should be that. Commands are as ragged as the noise in
+their feedback, and tell a dead time from a lag up to half the sampling rate, where the motion itself says nothing.
+
+A candidate's column is what it changes in the torque at given numbers; its coefficient is a presence that has to be one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pcw_description.compiled import ARRAY_SIGNATURE, compiled_for_kernel
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.kinds import ACTUATOR_INPUTS, MEMORY, MOTOR_RATE, STEP, TORQUE, ActuatorEffect
+from pcw_description.effects.registry import all_effects, get
+from pcw_description.recording import Recording
+from pcw_description.robot_description import AXIS_NAMES, RobotDescription
+
+from .regression_problem import BoolArray, Channel, FloatArray, LinearParameter, Nuisance, RegressionProblem, Shape, Term
+
+LARGEST_STEP = 1e-3  # [s] of the kernels
+LARGEST_GAP = 0.05  # [s]
+SHORTEST = 1.0  # [s]
+# Nobody knows how long a command was on its way within its own cycle: this part of a cycle either way.
+LATENCY_PART = 0.25
+PRESENCE = LinearParameter("presence", "1", 0.8, 1.25, 0.5, hidden=True)
+TIMES = (1e-3, 2e-3, 3e-3, 5e-3, 8e-3, 13e-3, 20e-3, 35e-3, 60e-3)  # [s], of lags and dead times
+TIME_SPACING = 1.7
+# Torques at which a drive may give no more, by how much of the time more was asked of it.
+QUANTILES = (0.3, 0.5, 0.65, 0.8, 0.88, 0.94, 0.97, 0.985)
+KNEES = (0.2, 0.4, 0.6, 0.8)  # parts of the largest speed from which the voltage limits
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandedJoint:
+    """One joint of one contiguous piece, at the rate of joint_states; arrays (T,).
+
+    Attributes:
+        time: [s]; interval: between samples [s].
+        command: held at each sample, within the joint's limit; torque: reported [N m]; rate: of the joint [rad/s].
+    """
+
+    recording: int
+    interval: float
+    time: FloatArray
+    command: FloatArray
+    torque: FloatArray
+    rate: FloatArray
+
+
+@compiled_for_kernel(ARRAY_SIGNATURE, "float64[::1]", "float64[::1], int64, float64[::1], float64[::1], float64, int64")
+def _torque_along(kernel, values, memory, command, rate, interval, substeps):  # type: ignore[no-untyped-def]
+    """Torque (T,) of an actuator at the end of each interval in which it held a command (T,)."""
+    found = command.copy()
+    at = np.zeros(ACTUATOR_INPUTS)
+    state = np.zeros(memory)
+    at[STEP] = interval / substeps
+    for t in range(len(command)):
+        at[MOTOR_RATE] = rate[t]
+        for _ in range(substeps):
+            state[TORQUE] = command[t]
+            kernel(at, values, state)
+        found[t] = state[TORQUE]
+    return found
+
+
+def through(effect: ActuatorEffect, values: Mapping[str, float], joint: CommandedJoint, command: FloatArray) -> FloatArray:
+    """Return the torque (T,) [N m] that an actuator with the effect makes of a command (T,)."""
+    substeps = max(1, int(np.ceil(joint.interval / LARGEST_STEP - 1e-6)))
+    memory = MEMORY + effect.memory(values, joint.interval / substeps)
+    torque: FloatArray = _torque_along(
+        effect.drive, effect.values(values), memory, command, joint.rate, joint.interval, substeps
+    )
+    return torque
+
+
+def commanded_joints(
+    robot: RobotDescription, recordings: Sequence[Recording]
+) -> dict[tuple[int, int], list[CommandedJoint]]:
+    """Return the pieces of every joint (caster, axis) that has torque commands and reported torques in all recordings."""
+    found: dict[tuple[int, int], list[CommandedJoint]] = {}
+    for index, recording in enumerate(recordings):
+        commands, joints = recording.joint_commands, recording.joint_states
+        if commands is None or commands.effort is None or joints.effort is None or len(commands.stamp) < 2:
+            return {}
+        limit = robot.torque_limit
+        # What is reported at a stamp is the answer to the command before it.
+        held = np.searchsorted(commands.stamp, joints.stamp - 1e-6, side="left") - 1
+        fresh = (held >= 0) & (joints.stamp - commands.stamp[np.maximum(held, 0)] < LARGEST_GAP)
+        for i in range(robot.n):
+            for axis in range(2):
+                command = np.clip(commands.effort[np.maximum(held, 0), i, axis], -limit[i, axis], limit[i, axis])
+                usable = fresh & np.isfinite(command) & np.isfinite(joints.effort[:, i, axis])
+                for piece in _pieces(joints.stamp, np.asarray(usable)):
+                    own = np.nan_to_num(joints.velocity[piece, i, axis])
+                    found.setdefault((i, axis), []).append(
+                        CommandedJoint(
+                            index, float(np.median(np.diff(joints.stamp[piece]))), joints.stamp[piece],
+                            np.ascontiguousarray(command[piece]), joints.effort[piece, i, axis], np.ascontiguousarray(own),
+                        )
+                    )
+    return found
+
+
+def _pieces(stamp: FloatArray, usable: BoolArray) -> list[slice]:
+    """Runs of usable samples without a gap that last long enough."""
+    broken = np.r_[False, np.diff(stamp) > LARGEST_GAP]
+    index = np.cumsum(broken | np.r_[False, usable[1:] != usable[:-1]])
+    found = []
+    for label in np.unique(index[usable]):
+        rows = np.flatnonzero((index == label) & usable)
+        if stamp[rows[-1]] - stamp[rows[0]] >= SHORTEST:
+            found.append(slice(int(rows[0]), int(rows[-1]) + 1))
+    return found
+
+
+def command_problems(robot: RobotDescription, recordings: Sequence[Recording]) -> list[RegressionProblem]:
+    """Return one problem per joint with commands, in the order of the joints."""
+    pieces = commanded_joints(robot, recordings)
+    return [_JointProblem(robot, i, axis, own).problem() for (i, axis), own in sorted(pieces.items())]
+
+
+class _JointProblem:
+    """The problem of one joint."""
+
+    def __init__(self, robot: RobotDescription, i: int, axis: int, pieces: Sequence[CommandedJoint]) -> None:
+        self.robot, self.pieces = robot, pieces
+        self.caster, self.axis = robot.caster_names[i], AXIS_NAMES[axis]
+        known = [
+            instance for instance in robot.physics
+            if isinstance(get(instance.name), ActuatorEffect) and self.caster in instance.target
+            and (instance.axis or get(instance.name).axis) == self.axis
+        ]
+        self._known = sorted(known, key=lambda instance: get(instance.name).stage)  # type: ignore[attr-defined]
+        self._plain = self._torques(())
+
+    def _torques(self, more: Sequence[EffectInstance]) -> FloatArray:
+        """Torque of all pieces on end (T,) with the robot's own effects and more of them, each in its stage."""
+        chain = sorted((*self._known, *more), key=lambda instance: get(instance.name).stage)  # type: ignore[attr-defined]
+        found = []
+        for piece in self.pieces:
+            torque = piece.command
+            for instance in chain:
+                effect = get(instance.name)
+                assert isinstance(effect, ActuatorEffect)
+                torque = through(effect, instance.parameters, piece, torque)
+            found.append(torque)
+        return np.concatenate(found)
+
+    def problem(self) -> RegressionProblem:
+        """Return the regression problem."""
+        measured = np.concatenate([piece.torque for piece in self.pieces])
+        lengths = [len(piece.time) for piece in self.pieces]
+        return RegressionProblem(
+            channels=(Channel(f"command_tracking/{self.caster}_{self.axis}", "N m", (self.caster,), self.axis),),
+            time=np.concatenate([piece.time for piece in self.pieces]),
+            segment=np.repeat(np.arange(len(self.pieces)), lengths),
+            recording=np.repeat([piece.recording for piece in self.pieces], lengths),
+            rate=1.0 / self.pieces[0].interval,
+            measured=measured[:, None],
+            residual=(measured - self._plain)[:, None],
+            valid=np.ones((len(measured), 1), dtype=bool),
+            nuisances=tuple(self._nuisances()),
+            terms=tuple(self._terms()),
+            variables=self._variables(),
+        )
+
+    def _nuisances(self) -> list[Nuisance]:
+        interval = self.pieces[0].interval
+        # The mean of a little later and a little earlier, which past samples alone can give to first order.
+        earlier = np.concatenate([np.r_[piece.command[:1], piece.command[:-1]] for piece in self.pieces])
+        latency = (earlier - self._plain) / interval
+        found = [Nuisance("command_latency", "s", 0.0, LATENCY_PART * interval, latency[:, None])]
+        gain = self.robot.tolerance("torque_constant").value
+        if gain > 0.0:
+            found.append(Nuisance("reported_torque", "1", 1.0, gain, self._plain[:, None]))
+        return found
+
+    def _column(self, effect: ActuatorEffect, shape: Shape) -> FloatArray:
+        instance = EffectInstance(effect.name, (self.caster,), dict(shape), self.axis)
+        return (self._torques([instance]) - self._plain)[:, None, None]
+
+    def _terms(self) -> list[Term]:
+        found = []
+        for effect in all_effects().values():
+            if not isinstance(effect, ActuatorEffect) or self.axis not in (effect.axes or (effect.axis,)):
+                continue
+            shapes, resolution = self._grid(effect)
+            if shapes:
+                found.append(
+                    Term(
+                        effect=effect.name, target=(self.caster,), parameters=(PRESENCE,), shapes=shapes,
+                        columns=functools.partial(self._column, effect), resolution=resolution, log_prior=effect.log_prior,
+                        axis=self.axis if effect.axes else None, arguments=("command", "velocity"),
+                    )
+                )
+        return found
+
+    def _grid(self, effect: ActuatorEffect) -> tuple[tuple[dict[str, float], ...], dict[str, tuple[str, float]]]:
+        """Numbers to try: times on a logarithmic scale, torques that were asked for, and speeds that were reached."""
+        defaults = {p.name: p.default for p in effect.parameters if p.default is not None}
+        needed = [p for p in effect.parameters if p.default is None]
+        if len(needed) != 1:
+            return (), {}
+        [first] = needed
+        if first.unit == "s":
+            return tuple({**defaults, first.name: t} for t in TIMES), {first.name: ("log", TIME_SPACING)}
+        if first.unit != "N m":
+            return (), {}
+        command = np.abs(self._plain)
+        torques = np.unique(np.quantile(command, QUANTILES))
+        shapes = [{**defaults, first.name: float(t)} for t in torques if t > 0.0]
+        resolution = {first.name: ("log", 1.3)}
+        if {"knee_speed", "no_load_speed"} <= set(defaults):
+            top = float(np.max(np.abs(np.concatenate([piece.rate for piece in self.pieces]))))
+            largest = 1.05 * float(command.max())
+            shapes += [
+                {**defaults, first.name: largest, "knee_speed": part * top, "no_load_speed": (part + gap) * top}
+                for part in KNEES for gap in (0.3, 0.8, 2.0) if top > 0.0
+            ]
+        return tuple(shapes), resolution
+
+    def _variables(self) -> dict[str, FloatArray]:
+        return {
+            "time": np.concatenate([piece.time for piece in self.pieces]),
+            "command": np.concatenate([piece.command for piece in self.pieces]),
+            "velocity": np.concatenate([piece.rate for piece in self.pieces]),
+        }
