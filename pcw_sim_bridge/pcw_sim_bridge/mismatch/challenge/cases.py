@@ -1,6 +1,6 @@
 """Cases of the challenge: which there are, what each conceals, and its answer.
 
-An answer is a mapping that goes into the sealed file as JSON; it alone is enough to record the case. See `Answer` for its keys.
+An answer is a mapping that goes into the sealed file as JSON; it alone is enough to record the case. `Answer` has its keys.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ def order_cases(
         if value < least:
             raise MismatchError(f"{option} {value} is not allowed; allowed: {least} and more")
     if not SHORTEST_RUN <= durations[0] <= durations[1] <= LONGEST_RUN:
-        raise MismatchError(f"--durations {durations} is not allowed; allowed: {SHORTEST_RUN:g} to {LONGEST_RUN:g} s, in order")
+        allowed = f"allowed: {SHORTEST_RUN:g} to {LONGEST_RUN:g} s, the shorter first"
+        raise MismatchError(f"--durations {durations[0]:g} {durations[1]:g} is not allowed; {allowed}")
     rng = np.random.default_rng([seed, count])
     drawn_kinds = _shared({kind: KINDS[kind] for kind in kinds}, count, rng)
     drawn_plants = _shared({plant: PLANT_SHARES[plant] for plant in plants}, count, rng)
