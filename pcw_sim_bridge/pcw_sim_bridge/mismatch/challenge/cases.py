@@ -56,7 +56,7 @@ LEAST_EVIDENCE = 18.0  # [nats]
 # Effects are drawn log-uniform between the floor and so many times the floor ...
 STRENGTHS = (1.1, 20.0)
 # ... and scaled until they are that strong to within this factor, where their limits let them.
-STRENGTH_WITHIN = 1.7
+STRENGTH_WITHIN = 2.0
 SHARE_OF_TWO_RECORDINGS = 0.25
 # What somebody tunes to make the effect go away stays so near to the description, in standard deviations.
 RETUNED_WITHIN = 2.0
@@ -264,11 +264,12 @@ class _Drawing:
     def _cancelling(self, number: str, scene: Scene, place: float) -> _Group:
         """Two effects whose sizes go together."""
         pair = CANCELLING[int(number)]
+        targets: tuple[str, ...]
         if pair.first == pair.second:
             one, other = (str(name) for name in self._rng.choice(scene.robot.caster_names, 2, replace=False))
             first, targets = draw_effect(pair.first, scene, place, (one,)), (other,)
         else:
-            targets = scene.robot.caster_names
+            targets = tuple(scene.robot.caster_names)
             on_casters = all_effects()[pair.first].target_kind == "caster"
             first = draw_effect(pair.first, scene, place, targets if on_casters else None)
 

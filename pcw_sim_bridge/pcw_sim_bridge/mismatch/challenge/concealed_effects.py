@@ -384,7 +384,7 @@ def _imu_error(low: float, high: float, gyro: float, accelerometer: float) -> Ca
             scene.pick("accelerometer_x", "accelerometer_y"), accelerometer
         )
         sign = scene.sign()
-        return Recipe(low, high, lambda m: {"gyro": 0.0, name: sign * m * size}, limit=5.0 * high, target=("imu",))
+        return Recipe(low, high, lambda m: {"gyro": 0.0, name: sign * m * size}, limit=2.0 * high, target=("imu",))
 
     return recipe
 

@@ -95,7 +95,8 @@ def _replaced(part: Any, field: str, value: float) -> Any:
     return dataclasses.replace(part, **{field: getattr(part, field) + value})
 
 
-def _entry(values: tuple[float, ...], index: int, value: float) -> tuple[float, ...]:
+def _entry(values: tuple[float, ...], index: int, value: float) -> Any:
+    """Return the tuple with one of its entries moved."""
     return (*values[:index], values[index] + value, *values[index + 1 :])
 
 

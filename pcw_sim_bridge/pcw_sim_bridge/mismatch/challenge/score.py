@@ -216,6 +216,8 @@ def _naming(by_kind: Mapping[str, Sequence[Judgement]]) -> list[Figure]:
         _share(1, "right, or with others beside", (j.outcome in (*SEEN, "right beside others") for j in singles), of),
         _share(1, "exact set", (j.outcome == "right" for j in pairs), "pairs above the floor", at_least=0.80),
         _share(1, "right or in set, below the floor", (j.outcome in SEEN for j in faint), "singles and pairs below it"),
+        # The floor is that of the analyser's own channels: an effect that none of them shows is below it, however large.
+        _share(1, "right or in set, of any size", (j.outcome in SEEN for j in by_kind["single"]), "singles"),
     ]
 
 

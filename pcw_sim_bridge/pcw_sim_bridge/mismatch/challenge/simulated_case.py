@@ -12,7 +12,7 @@ from pcw_control.excitation import make_excitation
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.effect import Effect
 from pcw_description.effects.registry import also_known
-from pcw_description.recording_series import ImuSeries, JointSeries, OdometrySeries, TwistSeries
+from pcw_description.recording_series import ImuSeries, IntArray, JointSeries, OdometrySeries, TwistSeries
 from pcw_description.robot_description import FloatArray, RobotDescription
 
 from ...plants.factory import make_plant
@@ -165,9 +165,9 @@ class _Collector:
         """Return everything so far, time counted from the first joint reading."""
         start = self._joints[0][0]
 
-        def stamps(entries: Sequence[tuple[int, object]]) -> tuple[FloatArray, np.ndarray]:
-            stamp_ns = np.array([stamp for stamp, _ in entries], dtype=np.int64)
-            return (stamp_ns - start) * 1e-9, stamp_ns
+        def stamps(entries: Sequence[tuple[int, object]]) -> tuple[FloatArray, IntArray]:
+            stamp_ns: IntArray = np.array([stamp for stamp, _ in entries], dtype=np.int64)
+            return ((stamp_ns - start) * 1e-9).astype(np.float64), stamp_ns
 
         names = robot.joint_names
         joints = [reading for _, reading in self._joints]
@@ -195,7 +195,7 @@ class _Collector:
             imu=imu,
             ground_truth=OdometrySeries(
                 *stamps(self._truth), np.array([r.pose for _, r in self._truth]),
-                np.array([r.truth.twist for _, r in self._truth]), "map", "base_link",
+                np.array([r.truth.twist for _, r in self._truth]), "odom", "base_link",
             ),
             cmd_vel=TwistSeries(*stamps(self._twist), np.array([t for _, t in self._twist])) if self._twist else None,
         )
