@@ -12,7 +12,15 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects
 from pcw_description.errors import DescriptionError
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.challenge.cases import KINDS, MASKINGS, effects_of, order_cases, prepare_case, runs_of, world_of
+from pcw_sim_bridge.mismatch.challenge.cases import (
+    KINDS,
+    MASKINGS,
+    effects_of,
+    order_cases,
+    prepare_case,
+    runs_of,
+    world_of,
+)
 from pcw_sim_bridge.mismatch.challenge.concealed_effects import (
     CANCELLING,
     HIDDEN_BY_CONTROL,

@@ -53,7 +53,11 @@ def answer_file(folder: Path) -> Path:
 
 def test_answers_are_sealed_and_what_the_seed_gives(challenge: Path) -> None:
     content = answer_file(challenge).read_bytes()
-    assert (challenge / HASH_FILE).read_text().split()[0] == hashlib.sha256(content).hexdigest()
+    promise = challenge / HASH_FILE
+    assert promise.read_text().split()[0] == hashlib.sha256(content).hexdigest()
+    recordings = list(challenge.rglob("*.mcap"))
+    assert len(recordings) >= 2 * COUNT
+    assert all(promise.stat().st_mtime_ns < path.stat().st_mtime_ns for path in recordings)
     answers = json.loads(content)["cases"]
     [order] = [order for order in order_cases(COUNT, SEED, **OPTIONS) if order.kind == "single"]  # type: ignore[arg-type]
     [single] = [answer for answer in answers if answer["kind"] == "single"]

@@ -26,6 +26,7 @@ from pcw_sim_bridge.mismatch.challenge.sealed_answers import HASH_FILE, seal
 from pcw_sim_bridge.mismatch.errors import MismatchError
 
 ROBOT = robot_to_mapping(load_robot("thesis"))
+RUN = {"path": "recordings/run_1", "excitation": "chirps", "duration": 30.0, "seed": 1, "active": True}
 FRICTION = {"coulomb": 0.5, "asymmetry": 0.0, "smoothing_speed": 0.05}
 
 
@@ -41,8 +42,7 @@ def answer(kind: str, *effects: dict[str, Any], **changes: Any) -> dict[str, Any
     return {
         "case": "case_0001", "kind": kind, "masking": None, "plant": "reduced", "controller": "computed_torque",
         "robot": "thesis", "noise": 1.0, "effects": list(effects), "deviations": {}, "retuned": {}, "nominal": ROBOT,
-        "true": ROBOT, "runs": [{"path": "recordings/run_1", "excitation": "chirps", "duration": 30.0, "seed": 1, "active": True}],
-        **changes,
+        "true": ROBOT, "runs": [RUN], **changes,
     }  # fmt: skip
 
 
@@ -220,7 +220,8 @@ def challenge(folder: Path, cases: list[tuple[dict[str, Any], dict[str, Any] | N
 
 def test_the_page_has_every_figure_and_every_miss(tmp_path: Path) -> None:
     wrong = report(named("rolling_resistance", "rear_left"))
-    sealed = challenge(tmp_path / "ch", [(SINGLE, report(named())), (SINGLE, wrong), (answer("none"), report()), (SINGLE, None)])
+    cases = [(SINGLE, report(named())), (SINGLE, wrong), (answer("none"), report()), (SINGLE, None)]
+    sealed = challenge(tmp_path / "ch", cases)
     found = score(tmp_path / "ch", sealed, None, lambda message: None)
     written, printed = page(found), text(found)
     assert found.digest in written and "seed 5" in printed

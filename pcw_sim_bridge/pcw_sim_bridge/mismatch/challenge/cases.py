@@ -53,10 +53,10 @@ HOLDOUT_SHARE = 0.7  # the held-out recording may be shorter: it only tests
 LEAST_SIZE = 3.0
 # ... and larger than a healthy robot explains: re-tuning it away takes 6 standard deviations of the tolerances at least.
 LEAST_EVIDENCE = 18.0  # [nats]
-# Effects are drawn log-uniform between the floor and so many times the floor ...
+# Magnitudes are drawn log-uniform; one that turns out below the floor, or above the largest strength, is scaled to a strength
+# drawn log-uniform between these, in multiples of the floor.
 STRENGTHS = (1.1, 20.0)
-# ... and scaled until they are that strong to within this factor, where their limits let them.
-STRENGTH_WITHIN = 2.0
+LARGEST_STRENGTH = 30.0
 SHARE_OF_TWO_RECORDINGS = 0.25
 # What somebody tunes to make the effect go away stays so near to the description, in standard deviations.
 RETUNED_WITHIN = 2.0
@@ -282,7 +282,7 @@ class _Drawing:
     def _sized(
         self, group: _Group, run: Run, channels: HealthyChannels
     ) -> tuple[list[EffectInstance], EffectSize]:
-        """Return the effects of a group at the strength drawn, or as near as its limits and the robot allow."""
+        """Return the effects of a group at a strength that is seen, or as near as its limits and the robot allow."""
         factor = 1.0
         kept: tuple[list[EffectInstance], EffectSize] | None = None
         for _ in range(PROBES):
@@ -295,10 +295,9 @@ class _Drawing:
                 factor *= 0.3
                 continue
             kept = instances, size
-            missing = self._strength / _strength(size)
-            if 1.0 / STRENGTH_WITHIN < missing < STRENGTH_WITHIN and _strength(size) >= 1.0:
+            if 1.0 <= _strength(size) <= LARGEST_STRENGTH:
                 break
-            factor *= min(max(missing, 0.03), 30.0)
+            factor *= min(max(self._strength / _strength(size), 0.03), 30.0)
         if kept is None:
             raise MismatchError(f"{self._order.name}: {self._order.effects} at no size that the robot can be driven with")
         return kept

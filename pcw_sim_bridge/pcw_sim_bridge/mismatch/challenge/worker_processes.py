@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
+import os
 import resource
 import signal
 import sys
@@ -97,6 +98,7 @@ def _handed(worker: _Worker, waiting: list[tuple[str, tuple[Any, ...]]]) -> _Wor
 
 def _serve(connection: Connection, function: Callable[..., Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends us
+    os.dup2(2, 1)  # an engine that prints when it is loaded does not print among the parent's results
     while True:
         try:
             arguments = connection.recv()
