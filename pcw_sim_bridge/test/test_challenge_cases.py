@@ -199,7 +199,7 @@ def test_a_wheel_comes_onto_its_patch(scene: Scene, healthy: SimulatedRecording)
     for _ in range(5):
         patch = draw_effect("low_friction_patch", scene, 0.5).instance().parameters
         onset = first_on_patch(THESIS, healthy, patch)
-        assert onset is not None
+        assert onset is not None and onset > 0.0
         row = np.searchsorted(healthy.ground_truth.stamp, onset)
         place = wheel_paths(THESIS, healthy)[row] - [patch["x"], patch["y"]]
         assert np.linalg.norm(place, axis=1).min() < 0.5 * np.hypot(patch["length"], patch["width"])

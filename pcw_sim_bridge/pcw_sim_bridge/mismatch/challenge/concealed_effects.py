@@ -306,19 +306,19 @@ def first_on_patch(robot: RobotDescription, recording: SimulatedRecording, patch
 
 
 def _patch(scene: Scene) -> Recipe:
-    """A place that a wheel rolls over, not where it stands at the start."""
+    """A place that a wheel rolls over, and on which none stands at the start."""
     paths = wheel_paths(scene.robot, scene.healthy)
-    reached = np.linalg.norm(paths - paths[0], axis=2).max(axis=1)
-    moved = np.flatnonzero(reached > 0.3 * reached.max())
-    row = int(scene.rng.choice(moved))
-    x, y = paths[row, int(scene.rng.integers(scene.robot.n))]
-    length, width = scene.rng.uniform(0.25, 0.8, 2)
+    away = np.linalg.norm(paths[:, :, None] - paths[0], axis=3).min(axis=2)  # from where any wheel stood (T, n)
+    far = np.argwhere(away > 0.5 * away.max())
+    row, wheel = far[int(scene.rng.integers(len(far)))]
+    x, y = paths[row, wheel]
+    length, width = np.minimum(scene.rng.uniform(0.25, 0.8, 2), 1.3 * away[row, wheel])
     shape = {
-        "x": x, "y": y, "length": length, "width": width, "yaw": scene.rng.uniform(0.0, math.pi),
+        "x": x, "y": y, "length": max(length, 0.02), "width": max(width, 0.02), "yaw": scene.rng.uniform(0.0, math.pi),
         "roundness": float(scene.rng.choice([0.0, 1.0])),
     }
     return Recipe(
-        0.5, 0.95, lambda m: {"factor": 1.0 - m, **shape}, limit=0.98, target=scene.robot.caster_names
+        0.7, 3.0, lambda m: {"factor": math.exp(-m), **shape}, limit=4.0, target=scene.robot.caster_names
     )
 
 

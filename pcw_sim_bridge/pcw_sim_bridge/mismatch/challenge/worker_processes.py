@@ -113,7 +113,10 @@ def _serve(connection: Connection, function: Callable[..., Any]) -> None:
             error = str(failure)
         except Exception as failure:
             error = f"{type(failure).__name__}: {failure}"
-        connection.send((result, error, time.monotonic() - begun, _peak()))
+        try:
+            connection.send((result, error, time.monotonic() - begun, _peak()))
+        except BrokenPipeError:
+            return  # the parent was killed
 
 
 def _forget_peak() -> None:
