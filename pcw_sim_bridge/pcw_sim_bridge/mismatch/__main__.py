@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 from pcw_description.errors import PcwError
 
-from .commands import analyze, fleet, suggest
+from .commands import analyze, challenge, fleet, suggest
 
-COMMANDS = (analyze, fleet, suggest)
+COMMANDS = (analyze, challenge, fleet, suggest)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -29,9 +29,9 @@ LARGEST_GAP = 0.05  # [s]
 SHORTEST = 1.0  # [s]
 # Nobody knows how long a command was on its way within its own cycle: this part of a cycle either way.
 LATENCY_PART = 0.25
-PRESENCE = LinearParameter("presence", "1", 0.8, 1.25, 0.5, hidden=True)
-TIMES = (1e-3, 2e-3, 3e-3, 5e-3, 8e-3, 13e-3, 20e-3, 35e-3, 60e-3)  # [s], of lags and dead times
-TIME_SPACING = 1.7
+PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
+TIME_SPACING = 1.3
+TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
 # Torques at which a drive may give no more, by how much of the time more was asked of it.
 QUANTILES = (0.3, 0.5, 0.65, 0.8, 0.88, 0.94, 0.97, 0.985)
 KNEES = (0.2, 0.4, 0.6, 0.8)  # parts of the largest speed from which the voltage limits
@@ -210,7 +210,7 @@ class _JointProblem:
             return (), {}
         [first] = needed
         if first.unit == "s":
-            return tuple({**defaults, first.name: t} for t in TIMES), {first.name: ("log", TIME_SPACING)}
+            return tuple({**defaults, first.name: float(t)} for t in TIMES), {first.name: ("log", TIME_SPACING)}
         if first.unit != "N m":
             return (), {}
         command = np.abs(self._plain)
