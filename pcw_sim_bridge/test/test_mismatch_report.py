@@ -233,7 +233,7 @@ CONTRACT = {
         }
     },
 }
-ADDITIONS = {"retuned", "ladder", "notes"}
+ADDITIONS = {"retuned", "ladder", "notes", "generated_effects"}
 
 
 def check_structure(value: Any, wanted: Any, where: str = "report") -> None:

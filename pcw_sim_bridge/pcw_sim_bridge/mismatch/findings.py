@@ -183,7 +183,7 @@ class Findings:
     seconds: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of report.json (INTERFACES section 6; `retuned`, `ladder` and `notes` are additions)."""
+        """Return the content of report.json: INTERFACES section 6, and retuned, ladder, generated_effects and notes besides."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,
@@ -224,8 +224,6 @@ class Findings:
                     "depends_on": list(leftover.depends_on),
                     "expression": leftover.expression,
                     "share_explained": leftover.share_explained,
-                    "effect": leftover.effect_entry(),
-                    "without_effect": leftover.without_effect,
                 }
                 for leftover in self.unknown
             ],
@@ -247,6 +245,11 @@ class Findings:
                 for r in self.retuned
             ],
             "ladder": [dataclasses.asdict(step) for step in self.ladder],
+            "generated_effects": [
+                {"unknown": k, "effect": leftover.effect_entry(), "without_effect": leftover.without_effect}
+                for k, leftover in enumerate(self.unknown)
+                if leftover.effect is not None or leftover.without_effect
+            ],
             "notes": list(self.notes),
             "seconds": self.seconds,
         }
