@@ -183,7 +183,7 @@ class Findings:
     seconds: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of report.json: INTERFACES section 6, and retuned, ladder, generated_effects and notes besides."""
+        """Return the content of report.json: INTERFACES section 6, with retuned, ladder, generated_effects and notes added."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,
