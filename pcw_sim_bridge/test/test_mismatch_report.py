@@ -280,7 +280,7 @@ CONTRACT = {
         }
     },
 }
-ADDITIONS = {"retuned", "ladder", "notes", "absent"}
+ADDITIONS = {"retuned", "ladder", "notes", "absent", "generated_effects"}
 
 
 def check_structure(value: Any, wanted: Any, where: str = "report") -> None:

@@ -284,7 +284,7 @@ class Findings:
     absent: tuple[tuple[str, str], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of report.json (INTERFACES section 6; added: `retuned`, `ladder`, `absent` and `notes`)."""
+        """Return the content of report.json: INTERFACES section 6 and, added, retuned, ladder, absent, generated_effects, notes."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,
@@ -325,8 +325,6 @@ class Findings:
                     "depends_on": list(leftover.depends_on),
                     "expression": leftover.expression,
                     "share_explained": leftover.share_explained,
-                    "effect": leftover.effect_entry(),
-                    "without_effect": leftover.without_effect,
                 }
                 for leftover in self.unknown
             ],
@@ -340,6 +338,11 @@ class Findings:
             ],
             "ladder": [dataclasses.asdict(step) for step in self.ladder],
             "absent": [{"sensor": sensor, "cost": cost} for sensor, cost in self.absent],
+            "generated_effects": [
+                {"unknown": k, "effect": leftover.effect_entry(), "without_effect": leftover.without_effect}
+                for k, leftover in enumerate(self.unknown)
+                if leftover.effect is not None or leftover.without_effect
+            ],
             "notes": list(self.notes),
             "seconds": self.seconds,
         }

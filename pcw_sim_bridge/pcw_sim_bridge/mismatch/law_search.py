@@ -37,6 +37,8 @@ FOLDS = 5
 SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
 # A name stays beside a law if without the law it leaves less than this part of what both explain together.
 KEPT_PART = 0.02
+# A law that replaces a name must differ from it by this part of what the name does.
+REPLACED_PART = 0.15
 MENDING_PART = 0.05
 
 
@@ -172,7 +174,9 @@ class LawSearch:
             f"outside the library: {' and '.join(best.law.sites)} by {', '.join(best.law.depends_on)}:"
             f" {gain:.1f} nats, held out {held_out:.1f}"
         )
-        counts = min(gain, held_out) >= self.threshold and self._matters(problem, with_law, without)
+        replaced = [i not in best.names for i in self.names]
+        sure = min(gain, held_out) >= self.threshold
+        counts = sure and self._matters(problem, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
         dropped = tuple(i for i in self.names if i not in best.names)
         names, withdrawn = best.names, dropped
@@ -186,19 +190,30 @@ class LawSearch:
             tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
         )
 
-    def _matters(self, problem: RegressionProblem, with_law: Fit, without: Fit) -> bool:
-        """Whether the law moves the prediction of some channel by more than details and misjudgements of the model."""
+    def _matters(self, problem: RegressionProblem, with_law: Fit, without: Fit, dropped: Sequence[bool]) -> bool:
+        """Whether the law moves the prediction of some channel by more than details and misjudgements of the model.
+
+        Against a name that it replaces it is enough to differ by a fair part of what the name does: the model misjudges
+        that by no more than it misjudges everything.
+        """
         after = predicted(problem, with_law)
-        left = problem.residual - after
-        change = after - predicted(problem, without)
+        change, left = after - predicted(problem, without), problem.residual - after
+        replaced = np.zeros_like(change)
+        position = len(problem.nuisances)
+        for instance, drop in zip(without.instances, dropped, strict=True):
+            columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
+            replaced += drop * (columns @ without.mean[position : position + len(instance.active)])
+            position += len(instance.active)
         for channel in range(change.shape[1]):
             valid = problem.valid[:, channel]
             if not valid.any():
                 continue
-            size = float(np.sqrt(np.mean(change[valid, channel] ** 2)))
-            signal = float(np.sqrt(np.mean(problem.measured[valid, channel] ** 2)))
-            part = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
-            if size > max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), part):
+            sizes = [float(np.sqrt(np.mean(v[valid, channel] ** 2))) for v in (change, problem.measured, replaced)]
+            size, signal, own = sizes
+            enough = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
+            if own > 0.0:
+                enough = min(enough, max(REPLACED_PART * own, problem.scale_deviation * signal))
+            if size > max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), enough):
                 return True
         return False
 
