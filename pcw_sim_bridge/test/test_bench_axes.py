@@ -159,7 +159,7 @@ ARM = {"right": {}, "heavy": {"moment": 1.3}}
 def test_a_servo_with_an_arm(described: str, effects: tuple[str, ...]) -> None:
     """Gear friction and Stribeck friction are told under a load that changes with the angle; a wrong moment is re-tuned."""
     case = draw_bench_case(
-        np.random.default_rng(3), effects, 0.4, motion="sines", kind="rotary", travel=2.0, gravity=2.0, noise=0.01,
+        np.random.default_rng(3), effects, 0.4, motion="sines", kind="rotary", travel=2.0, gravity=2.0, noise=0.03,
         described_arm=ARM[described],
     )
     explanation = explained(case)
