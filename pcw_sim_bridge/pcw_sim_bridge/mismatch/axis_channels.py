@@ -109,7 +109,8 @@ def axis_motion(
         speed = derivative(position, rate) if recording.velocity is None else wide.smooth(values[:, 1])
         fine = refined(np.stack([position, speed, derivative(speed, rate), force], axis=1), factor)
         position, speed, acceleration, force = fine.T
-        floor = max(4.0 * creep, 2e-3 * float(np.max(np.abs(speed))))
+        rounding = 1e-12 * float(np.max(np.abs(position))) * factor * rate
+        floor = max(4.0 * creep, 2e-3 * float(np.max(np.abs(speed))), rounding)
         motions.append(
             AxisMotion(
                 recording=index,
