@@ -146,7 +146,7 @@ def explain(
     search, selection, result = judgement.search, judgement.selection, judgement.result
     problem = search.problem
     suspect: Refinement | None = None
-    undecided: Mapping[Instance, float] = {}
+    undecided: dict[Instance, float] = {}
     remarks: tuple[str, ...] = ()
     refined = _refined(search, selection, result)
     if refined is not None:
@@ -296,7 +296,10 @@ def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) 
             continue
         share = 1.0 - float(np.sum(residual[problem.valid] ** 2)) / max(before, 1e-300)
         kept, undecided = _still_needed(search, regression, instances, position, plain_fit, threshold)
-        if (leftover and share > SMALLEST_SHARE) or len(kept) < len(plain):
+        solid = [instance for instance in kept if instance not in undecided]
+        instead = regression.fit(solid).log_evidence + REFINEMENT_LOG_PRIOR - plain_fit.log_evidence
+        stands_in = len(solid) < len(plain) and instead > AMBIGUOUS
+        if (leftover and share > SMALLEST_SHARE) or stands_in:
             best = _Refined(plain, kept, kept.index(instances[position]), undecided, gain, share)
     return None if best is None else _searched_again(search, best, threshold)
 
