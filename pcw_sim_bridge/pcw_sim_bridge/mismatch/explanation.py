@@ -211,8 +211,8 @@ def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> E
     return dataclasses.replace(
         explanation,
         selection=selection,
-        named=named_terms(search, selection),
-        leftovers=result.leftovers,
+        named=tuple(entry for entry in named_terms(search, selection) if not is_unknown(search.problem, entry.instance)),
+        leftovers=(*(left for left in explanation.leftovers if left.law is not None), *result.leftovers),
         floor=result.floor,
         p_values=_p_values(search, selection, result),
     )

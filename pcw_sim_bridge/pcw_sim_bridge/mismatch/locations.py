@@ -39,7 +39,7 @@ def locate(explanation: Explanation, named: NamedTerm) -> LocationFinding:
     return LocationFinding(
         channels=tuple(problem.channels[c].name for c in channels),
         casters=named.term.target if effect.target_kind == "caster" and named.term.target != ("axis",) else (),
-        axis=effect.axis,
+        axis=named.term.axis or effect.axis,
         intervals=_intervals_of(explanation, named, values, at_work),
         region=region(problem, named.term.arguments, at_work),
         place=_place_of(effect, values),
@@ -55,7 +55,12 @@ def locate_leftover(explanation: Explanation, leftover: Leftover, path: FloatArr
         path: position (T, 2) of the robot on the floor; None on a bench.
     """
     problem = explanation.search.problem
-    c = [channel.name for channel in problem.channels].index(leftover.channel)
+    names = [channel.name for channel in problem.channels]
+    if leftover.channel not in names:  # a law at a joint: it shows in all channels, and stands where it acts
+        axis, _, caster = leftover.channel.partition("_torque/")
+        everywhere = tuple((float(t.min()), float(t.max())) for t in [problem.time[problem.recording == problem.recording[0]]])
+        return LocationFinding((leftover.channel,), (caster,) if caster else (), axis, everywhere, {})
+    c = names.index(leftover.channel)
     channel, valid = problem.channels[c], problem.valid[:, c]
     power = np.where(valid, _left(explanation)[:, c] ** 2, 0.0)
     power /= max(float(explanation.floor[c]), 1e-300) ** 2
