@@ -251,9 +251,27 @@ class _Trial:
         )
         term = _term_of(self.problem, doubt.first)
         first = _Truth(term.key, _shape(term, doubt.first.parameters), doubt.first.parameters)
-        rivals = [self.columns(*rival) for rival in self.rivals(doubt, known)]
+        alone = self.rivals(doubt, known)
+        rivals = [self.columns(*rival) for rival in alone] + self._on_both_axes(alone)
         mirrored = [self.columns(term, shape) for shape in (first.shape, *term.shapes)]
         return min(self._difference(base, first, rivals), self._difference(base, second, mirrored))
+
+    def _on_both_axes(self, rivals: Sequence[tuple[Term, Shape, list[str] | None]]) -> list[_Columns]:
+        """The rivals that stand at both axes of the same casters together, for every target with two."""
+        first: dict[tuple[str, ...], dict[str, _Columns]] = {}
+        for term, shape, names in rivals:
+            own = first.setdefault(term.target, {})
+            if term.key not in own:
+                own[term.key] = self.columns(term, shape, names)
+        return [
+            _Columns(
+                np.concatenate([part.values for part in parts.values()], axis=1),
+                np.concatenate([part.deviations for part in parts.values()]),
+                sum(part.log_prior for part in parts.values()),
+            )
+            for parts in first.values()
+            if len(parts) > 1
+        ]
 
     def _difference(self, base: _Columns, truth: _Truth, rivals: Sequence[_Columns]) -> float:
         term = next(term for term in self.problem.terms if term.key == truth.key)
