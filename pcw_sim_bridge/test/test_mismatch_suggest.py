@@ -10,13 +10,14 @@ import pytest
 import yaml
 
 from pcw_control.excitation import Excitation, make_excitation, read_excitation
-from pcw_description import load_robot
+from pcw_description import load_robot, save_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_sim_bridge.mismatch import separating_experiment
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.commands.suggest import odds, read_effect
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.findings import Findings
 from pcw_sim_bridge.mismatch.report import write_report
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -27,8 +28,10 @@ from pcw_sim_bridge.mismatch.separating_experiment import (
     find_remedy,
     rank,
     remedies,
+    simulated_problem,
     trial_excitations,
 )
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
@@ -40,7 +43,8 @@ def effect(**entry: object) -> EffectInstance:
     return read_physics([entry], THESIS.caster_names)[0]
 
 
-RESISTANCE = effect(name="rolling_resistance", target=ALL, arm=2e-3)
+# Small enough that jumping about leaves it open what it is.
+RESISTANCE = effect(name="rolling_resistance", target=ALL, arm=5e-4)
 FRICTION_INSTEAD = Doubt(RESISTANCE, "drive_coulomb_friction", THESIS.caster_names)
 
 
@@ -60,20 +64,20 @@ def few(*names: str) -> list[Excitation]:
 def test_a_doubt_is_settled_by_what_the_report_leads_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Rolling resistance and friction of all drives: along y they look alike, and the suggested manoeuvre tells them apart."""
-    findings = analysed(make_excitation("chirp_y", THESIS, 20.0), RESISTANCE, tmp_path)
+    """Rolling resistance and friction of all drives look alike in steps; the suggested manoeuvre tells them apart."""
+    findings = analysed(make_excitation("steps", THESIS, 20.0), RESISTANCE, tmp_path)
     [named] = findings.effects
     assert {named.name, *named.ambiguous_with} == {"rolling_resistance", "drive_coulomb_friction"}
     write_report(findings, None, tmp_path / "report")
-    monkeypatch.setattr(separating_experiment, "trial_excitations", lambda robot: few("chirp_y", "creep", "strafe"))
+    monkeypatch.setattr(separating_experiment, "trial_excitations", lambda robot: few("steps", "creep", "strafe"))
     monkeypatch.chdir(tmp_path)
     assert main(["suggest", "report", "--robot", "thesis", "--quiet"]) == 0
     said = capsys.readouterr().out
     assert said.splitlines()[0].startswith(f"To tell {named.name} on ")
-    assert "drive 20 s of creep: odds of more than a million to 1." in said
+    assert "drive 20 s of strafe: odds of more than a million to 1." in said
     assert "-p manoeuvre:=excitation.yaml -p robot:=thesis" in said
     content = yaml.safe_load(Path("excitation.yaml").read_text())
-    assert (content["format"], content["name"], content["duration"]) == ("pcw_excitation/1", "creep", 20.0)
+    assert (content["format"], content["name"], content["duration"]) == ("pcw_excitation/1", "strafe", 20.0)
     settled = analysed(read_excitation("excitation.yaml", THESIS), RESISTANCE, tmp_path)
     assert [(e.name, e.ambiguous_with) for e in settled.effects] == [("rolling_resistance", ())]
     assert settled.effects[0].probability > 0.999
@@ -86,7 +90,6 @@ def test_a_doubt_is_settled_by_what_the_report_leads_to(
     ("first", "second"),
     [
         (effect(name="drive_viscous_friction", target=ALL, viscous=0.03), "drive_coulomb_friction"),
-        (effect(name="payload_mass", target=["chassis"], mass=10.0), "torque_constant_error"),
         (effect(name="ground_slope", target=["chassis"], angle=0.02, direction=0.5), "constant_load"),
     ],
     ids=lambda value: value if isinstance(value, str) else value.name,
@@ -102,13 +105,28 @@ def test_after_the_suggested_manoeuvre_one_is_named_without_the_other(
     assert second not in findings.effects[0].ambiguous_with
 
 
-def test_what_is_foretold_is_about_what_a_recording_gives(tmp_path: Path) -> None:
-    """Along y there is next to nothing, creeping there is plenty: as probabilities of the analyser say."""
-    outcomes = {o.excitation: o for o in rank(THESIS, [FRICTION_INSTEAD], excitations=few("chirp_y", "creep"))}
-    assert 0.0 < outcomes["chirp_y"].nats < 5.0
-    assert outcomes["creep"].nats > 100.0
-    assert outcomes["creep"].needed == outcomes["creep"].duration
-    assert outcomes["chirp_y"].needed > 3.0 * outcomes["chirp_y"].duration
+@pytest.mark.parametrize(("name", "arm"), [("steps", 2e-3), ("chirp_x", 2e-3), ("strafe", 5e-4)])
+def test_what_is_foretold_is_about_what_a_recording_gives(name: str, arm: float) -> None:
+    """The evidence between the two sets in a simulated recording, against its expectation: within a factor of two.
+
+    The expectation knows nothing of the robust weights, and one recording scatters by sqrt(2 times its expectation).
+    """
+    resistance = effect(name="rolling_resistance", target=ALL, arm=arm)
+    [excitation] = few(name)
+    [outcome] = rank(THESIS, [Doubt(resistance, "drive_coulomb_friction", THESIS.caster_names)], excitations=[excitation])
+    problem = simulated_problem(THESIS, [resistance], excitation)
+    assert problem is not None
+    search = EffectSearch(problem, np.random.default_rng(0))
+    sets = [
+        [Instance(k, tuple(sorted(term.shapes[0].items())), term.base_indices())]
+        for effect_name in ("rolling_resistance", "drive_coulomb_friction")
+        for k, term in enumerate(problem.terms)
+        if (term.effect, term.target) == (effect_name, THESIS.caster_names)
+    ]
+    regression = search.whiten_at(search.residual_of(sets[0]))
+    given = regression.fit(sets[0]).log_evidence - regression.fit(sets[1]).log_evidence
+    print(f"{name}: foretold {outcome.nats:.1f} nats, given {given:.1f}")
+    assert 0.5 * outcome.nats - 5.0 < given < 2.0 * outcome.nats + 5.0
 
 
 def test_more_noise_in_the_report_asks_for_more_seconds() -> None:
@@ -117,19 +135,19 @@ def test_more_noise_in_the_report_asks_for_more_seconds() -> None:
         rank(THESIS, [FRICTION_INSTEAD], noise_floor=floor, excitations=few("creep"))[0]
         for floor in ({}, {"chassis_force/x": 3.0, "chassis_force/y": 3.0, "chassis_torque/z": 1.0})
     )
-    assert loud.nats < 0.1 * quiet.nats
+    assert loud.nats < 0.5 * quiet.nats
 
 
-def test_a_load_on_a_corner_helps_where_no_manoeuvre_does(tmp_path: Path) -> None:
-    """Straight along y at even load rolling resistance and friction are one; a known load tells them apart."""
-    [along_y] = few("chirp_y")
-    before = rank(THESIS, [FRICTION_INSTEAD], excitations=[along_y])[0]
+def test_a_load_on_a_corner_helps_where_no_manoeuvre_does() -> None:
+    """Of what even load leaves open, a known load on one corner tells more in the same manoeuvre."""
+    [steps] = few("steps")
+    before = rank(THESIS, [FRICTION_INSTEAD], excitations=[steps])[0]
     offered = [words for words, _ in remedies(THESIS)]
     assert len(offered) == 1, "this robot has every sensor"
-    remedy = find_remedy(THESIS, [FRICTION_INSTEAD], [], {}, [along_y], lambda message: None)
+    remedy = find_remedy(THESIS, [FRICTION_INSTEAD], [], {}, [steps], lambda message: None)
     assert remedy is not None
     assert remedy.words.startswith("a known load of")
-    assert remedy.outcome.nats > 5.0 * before.nats
+    assert remedy.outcome.nats > 3.0 * before.nats
     bare = dataclasses.replace(THESIS, sensors=dataclasses.replace(THESIS.sensors, imu=None, tracker=None))
     assert [words.split(" (")[0] for words, _ in remedies(bare)][:2] == ["an inertial measurement unit", "a tracked pose"]
 
@@ -175,7 +193,7 @@ def test_effects_are_given_by_name_place_or_in_full() -> None:
         (["--between", "drive_coulomb_friction/front", "ground_slope"], "front_left"),
         (["--between", "payload_mass", "ground_slope", "--out", "run.txt"], "allowed: a .yaml file"),
         (["--between", "payload_mass", "ground_slope", "--out", "gone/run.yaml"], "there is no folder"),
-        (["--between", "gear_backlash", "ground_slope"], "gear_backlash on .* is not searched for .* it takes joint_states"),
+        (["--between", "imu_bias", "ground_slope", "--robot", "blind.yaml"], "imu_bias on imu is not searched for.*imu/data"),
         (["--between", "payload_mass", "ground_slope", "--robot", "axis.yaml"], "is a bench axis"),
         (["--between", "payload_mass", "ground_slope", "--robot", "mpo700"], "torque control needs"),
     ],
@@ -192,6 +210,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
         "{format: pcw_axis/1, name: sled, kind: linear, provenance: {all: test}, inertia: 20.0, physics: [], columns: {time: "
         "{column: t, unit: s}, position: {column: x, unit: m}, force: {column: f, unit: N}}}"
     )
+    save_robot(dataclasses.replace(THESIS, sensors=dataclasses.replace(THESIS.sensors, imu=None)), "blind.yaml")
     assert main(["suggest", "--robot", "thesis", "--quiet", *arguments]) == 2
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1

@@ -14,7 +14,7 @@ theta_a^T K theta_a is what no combination of S can explain. The expected eviden
 two, all from one Gram matrix per manoeuvre; and it is asked both ways, since either may be true.
 
 The robot is simulated with A at work, so that what the manoeuvre can show, its noise and the samples that cannot be judged
-are those of a recording. What the model of the channels itself misjudges (`scale_deviation`) counts as noise.
+are those of a recording. What the model of the channels itself misjudges counts as noise.
 """
 
 from __future__ import annotations
@@ -159,7 +159,8 @@ def rank(
         Outcome(trial.excitation.name, round(trial.excitation.duration, 6), float(worst), trial.usable)
         for trial, worst in zip(trials, nats.min(axis=1), strict=True)
     ]
-    return sorted(outcomes, key=lambda outcome: (outcome.needed, -outcome.nats))
+    # Of those that are enough the one that moves everything: in a plainer one a third effect may look like both.
+    return sorted(outcomes, key=lambda outcome: (outcome.needed, outcome.excitation != "identification", -outcome.nats))
 
 
 def simulated_problem(
@@ -203,6 +204,7 @@ class _Trial:
     """One manoeuvre as the analyser sees it, whitened.
 
     Attributes:
+        weights: root of the information of each sample, in parts of what its whitened noise says (T, C).
         nuisance: whitened nuisance columns (R, K).
         usable: seconds that can be judged.
     """
@@ -210,6 +212,7 @@ class _Trial:
     excitation: Excitation
     problem: RegressionProblem
     noise: NoiseModel
+    weights: FloatArray
     nuisance: FloatArray
     usable: float
 
@@ -221,50 +224,64 @@ class _Trial:
         effects: Sequence[EffectInstance],
         noise_floor: Mapping[str, float],
     ) -> _Trial:
-        noise = _noise(problem, effects, noise_floor)
-        nuisance = _whitened(noise, problem, problem.nuisance_columns())
-        return cls(excitation, problem, noise, nuisance, float(problem.valid.any(axis=1).sum()) / problem.rate)
+        noise, weights = _noise(problem, effects, noise_floor)
+        usable = float(problem.valid.any(axis=1).sum()) / problem.rate
+        trial = cls(excitation, problem, noise, weights, np.zeros((0, 0)), usable)
+        return dataclasses.replace(trial, nuisance=trial.whitened(problem.nuisance_columns()))
+
+    def whitened(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns (T, C, K) and put them on end, (T C, K)."""
+        white = self.noise.whiten(columns, self.problem.valid, self.problem.segment) * self.weights[..., None]
+        return white.reshape(-1, columns.shape[2])
 
     def columns(self, term: Term, shape: Shape, names: Sequence[str] | None = None) -> _Columns:
         """Columns of a term with a shape: of the parameters named, default: all that are no refinement."""
         wanted = [k for k, p in enumerate(term.parameters) if (not p.refinement if names is None else p.name in names)]
-        values = _whitened(self.noise, self.problem, term.columns(dict(shape))[..., wanted])
+        values = self.whitened(term.columns(dict(shape))[..., wanted])
         return _Columns(values, np.array([term.parameters[k].deviation for k in wanted]), term.log_prior)
 
     def evidence(self, doubt: Doubt, second: _Truth, known: Sequence[EffectInstance]) -> float:
         """Least expected evidence for the truth [nats], whichever of the two it is."""
-        parts = [self.columns(term, _shape(term, effect.parameters)) for effect in known for term in [self.term_of(effect)]]
+        terms = [_term_of(self.problem, effect) for effect in known]
+        parts = [self.columns(t, _shape(t, effect.parameters)) for t, effect in zip(terms, known, strict=True)]
         base = _Columns(
             np.concatenate([self.nuisance, *(part.values for part in parts)], axis=1),
             np.concatenate([self.problem.nuisance_deviations(), *(part.deviations for part in parts)]),
             0.0,
         )
-        term = self.term_of(doubt.first)
+        term = _term_of(self.problem, doubt.first)
         first = _Truth(term.key, _shape(term, doubt.first.parameters), doubt.first.parameters)
-        rivals = [self.columns(*rival) for rival in self.rivals(doubt, known)]
-        found = [self._difference(base, first, rivals)]
-        if any(second.size.values()):
-            found.append(self._difference(base, second, [self.columns(term, shape) for shape in (first.shape, *term.shapes)]))
-        return min(found)
+        alone = self.rivals(doubt, known)
+        rivals = [self.columns(*rival) for rival in alone] + self._on_both_axes(alone)
+        mirrored = [self.columns(term, shape) for shape in (first.shape, *term.shapes)]
+        return min(self._difference(base, first, rivals), self._difference(base, second, mirrored))
+
+    def _on_both_axes(self, rivals: Sequence[tuple[Term, Shape, list[str] | None]]) -> list[_Columns]:
+        """The rivals that stand at both axes of the same casters together, for every target with two."""
+        first: dict[tuple[str, ...], dict[str, _Columns]] = {}
+        for term, shape, names in rivals:
+            own = first.setdefault(term.target, {})
+            if term.key not in own:
+                own[term.key] = self.columns(term, shape, names)
+        return [
+            _Columns(
+                np.concatenate([part.values for part in parts.values()], axis=1),
+                np.concatenate([part.deviations for part in parts.values()]),
+                sum(part.log_prior for part in parts.values()),
+            )
+            for parts in first.values()
+            if len(parts) > 1
+        ]
 
     def _difference(self, base: _Columns, truth: _Truth, rivals: Sequence[_Columns]) -> float:
         term = next(term for term in self.problem.terms if term.key == truth.key)
         names = [p.name for p in term.parameters if p.name in truth.size and (truth.size[p.name] or not p.refinement)]
         own = self.columns(term, truth.shape, names)
-        sent = own.values @ np.array([truth.size[p.name] for p in term.parameters if p.name in names])
+        sent = own.values @ _coefficients(term, truth.size, names)
+        if not np.any(sent):  # too far from its like to stand for it at any size
+            return math.inf
         count = self.nuisance.shape[1]
         return _expected(base, own, sent, count) - max(_expected(base, rival, sent, count) for rival in rivals)
-
-    def term_of(self, effect: EffectInstance) -> Term:
-        """The candidate that an effect is for the analyser.
-
-        Raises:
-            MismatchError: there is none.
-        """
-        for term in self.problem.terms:
-            if term.effect == effect.name and term.target == effect.target:
-                return term
-        raise MismatchError(_not_searched(self.problem, effect.name, effect.target))
 
     def rivals(self, doubt: Doubt, known: Sequence[EffectInstance]) -> list[tuple[Term, Shape, list[str] | None]]:
         """Every form that the second effect of a doubt may take: term, shape, parameters.
@@ -287,6 +304,25 @@ class _Trial:
         if not found:
             raise MismatchError(_not_searched(self.problem, doubt.second, doubt.second_target))
         return found
+
+
+def _term_of(problem: RegressionProblem, effect: EffectInstance) -> Term:
+    """The candidate that an effect is for the analyser.
+
+    Raises:
+        MismatchError: there is none.
+    """
+    for term in problem.terms:
+        axis = effect.axis or get(effect.name).axis
+        if (term.effect, term.target) == (effect.name, effect.target) and term.axis in (None, axis):
+            return term
+    raise MismatchError(_not_searched(problem, effect.name, effect.target))
+
+
+def _coefficients(term: Term, size: Mapping[str, float], names: Sequence[str]) -> FloatArray:
+    """What the columns of some parameters of a term are multiplied by, for given values of the parameters."""
+    chosen = [p for p in term.parameters if p.name in names]
+    return np.array([1.0 / size[p.name] if p.reciprocal else size[p.name] - p.origin for p in chosen])
 
 
 def _not_searched(problem: RegressionProblem, name: str, target: tuple[str, ...] | None) -> str:
@@ -317,9 +353,10 @@ def _second(trials: Sequence[_Trial], doubt: Doubt, known: Sequence[EffectInstan
         names = [p.name for p in term.parameters if (not p.refinement if chosen is None else p.name in chosen)]
         gram, moment, power = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0
         for trial in trials:
-            own = trial.term_of(doubt.first)
+            own = _term_of(trial.problem, doubt.first)
             columns = trial.columns(own, _shape(own, doubt.first.parameters)).values
-            sent = columns @ np.array([doubt.first.parameters[p.name] for p in own.parameters if not p.refinement])
+            base = [p.name for p in own.parameters if not p.refinement]
+            sent = columns @ _coefficients(own, doubt.first.parameters, base)
             alike = trial.columns(next(t for t in trial.problem.terms if t.key == term.key), shape, names).values
             gram, moment, power = gram + alike.T @ alike, moment + alike.T @ sent, power + float(sent @ sent)
         fitted = np.linalg.lstsq(gram, moment, rcond=None)[0]
@@ -327,23 +364,23 @@ def _second(trials: Sequence[_Trial], doubt: Doubt, known: Sequence[EffectInstan
         fitted = np.clip(fitted, bounds[:, 0], bounds[:, 1])
         apart = power - 2.0 * float(fitted @ moment) + float(fitted @ gram @ fitted)
         if apart < least:
-            best, least = _Truth(term.key, shape, dict(zip(names, fitted.tolist(), strict=True))), apart
+            chosen_parameters = [p for p in term.parameters if p.name in names]
+            size = {p.name: p.value(float(c)) for p, c in zip(chosen_parameters, fitted, strict=True)}
+            best, least = _Truth(term.key, shape, size), apart
     assert best is not None  # `rivals` has raised otherwise
     return best
 
 
-def _whitened(noise: NoiseModel, problem: RegressionProblem, columns: FloatArray) -> FloatArray:
-    """Whiten columns (T, C, K) and put them on end, (T C, K)."""
-    return noise.whiten(columns, problem.valid, problem.segment).reshape(-1, columns.shape[2])
-
-
 def _noise(
     problem: RegressionProblem, effects: Sequence[EffectInstance], noise_floor: Mapping[str, float]
-) -> NoiseModel:
-    """Noise of a simulated recording when all that is at work is fitted, no quieter than a real one's."""
-    terms = [t for t in problem.terms if any((t.effect, t.target) == (e.name, e.target) for e in effects)]
-    shapes = {(e.name, e.target): e.parameters for e in effects}
-    parts = [t.columns(dict(_shape(t, shapes[t.effect, t.target])))[..., list(t.base_indices())] for t in terms]
+) -> tuple[NoiseModel, FloatArray]:
+    """Noise of a simulated recording when all that is at work is fitted, and the root weights (T, C) of its samples.
+
+    They are lower where the real recordings were louder, and where the model itself misjudges.
+    """
+    terms = [_term_of(problem, effect) for effect in effects]
+    pairs = zip(terms, effects, strict=True)
+    parts = [t.columns(dict(_shape(t, effect.parameters)))[..., list(t.base_indices())] for t, effect in pairs]
     columns = np.concatenate([problem.nuisance_columns(), *parts], axis=2)
     deviations = np.concatenate(
         [problem.nuisance_deviations(), *([t.parameters[i].deviation for i in t.base_indices()] for t in terms)]
@@ -356,12 +393,12 @@ def _noise(
         precision = rows.T @ rows + np.diag(deviations**-2.0)
         mean = np.linalg.solve(precision, rows.T @ np.where(valid, problem.residual * weight, 0.0).ravel())
         residual = problem.residual - columns @ mean
-    noise = fit_noise_model(residual, valid, problem.segment)
     size = _rms(residual, valid)
     real = np.array([noise_floor.get(channel.name, 0.0) for channel in problem.channels])
-    misjudged = problem.scale_deviation * _rms(problem.measured, valid)
-    louder = np.hypot(np.maximum(real, size), misjudged) / size
-    return NoiseModel(noise.taps / louder[:, None], noise.correlation)
+    information = np.array([channel.information for channel in problem.channels])
+    misjudged = np.zeros_like(residual) if problem.misjudged is None else problem.misjudged
+    louder = (np.maximum(real, size) ** 2 + misjudged**2) / size**2
+    return fit_noise_model(residual, valid, problem.segment), np.sqrt(information / louder)
 
 
 def _rms(values: FloatArray, valid: np.ndarray) -> FloatArray:
