@@ -13,6 +13,7 @@ import numpy as np
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 
+from .command_findings import command_findings
 from .evidence_selection import LadderStep, SelectionSettings
 from .explanation import Explanation, NamedTerm, explain, explanation_by
 from .findings import (
@@ -29,7 +30,7 @@ from .findings import (
 from .generated_effect import NoSuchKernelError, generate
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
-from .proof import Proof, Prover, effect_instance
+from .proof import Proof, Prover, effect_instance, with_channels
 from .regression_problem import FloatArray, RegressionProblem
 from .subject import Subject
 from .whitened_regression import Fit, predicted
@@ -93,14 +94,18 @@ def analyse(
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
     explanation = explain(problem, np.random.default_rng(seed), settings, progress)
     progress("proving it on held-out data")
+    commands = command_findings(
+        subject.command_problems(opened), subject.command_problems(held_out), seed, settings, progress
+    )
     prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
     proof = prover.prove(explanation)
     explanation = proof.explanation
     problem = explanation.search.problem
-    instances = [_instance(named) for named in explanation.named]
+    everything = [*((named, _instance(named)) for named in explanation.named), *commands.named]
+    instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
     patched = subject.patched(instances, _reported_numbers(explanation)) if instances else subject
-    leftovers = explanation.leftovers
+    leftovers = (*explanation.leftovers, *commands.leftovers)
     verdict = {
         (True, False): "explained",
         (True, True): "partly_explained",
@@ -112,16 +117,17 @@ def analyse(
         subject=subject.name,
         verdict=verdict,
         inputs=inputs,
-        channels=_channels(explanation),
+        channels=(*_channels(explanation), *commands.channels),
         locations=(
             *(locate(explanation, named) for named in explanation.named),
-            *(locate_leftover(explanation, leftover, path) for leftover in leftovers),
+            *commands.locations,
+            *(locate_leftover(explanation, leftover, path) for leftover in explanation.leftovers),
         ),
-        effects=tuple(_effect_finding(subject, named, e) for named, e in zip(explanation.named, instances, strict=True)),
+        effects=tuple(_effect_finding(subject, named, e) for named, e in everything),
         unknown=_unknown(leftovers, [str(path) for path in fit]),
         retuned=retuned,
-        fit=proof.finding,
-        ladder=(*_ladder(explanation.selection.ladder), *proof.dropped),
+        fit=with_channels(proof.finding, commands.proofs),
+        ladder=(*_ladder(explanation.selection.ladder), *proof.dropped, *commands.ladder),
         traces=(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
             *(_traces(prover.other, proof.predicted, explanation.fit, "holdout") if prover.other is not None else ()),

@@ -58,6 +58,10 @@ class AxisSubject:
         self._cutoff = builder.cutoff
         return builder.build(self._smoothing)
 
+    def command_problems(self, opened: Sequence[Opened]) -> Sequence[RegressionProblem]:
+        """Return nothing: what a bench records is the force itself."""
+        return ()
+
     def unit(self, unit: str) -> str:
         """Return a unit as it is on this axis."""
         return self.axis.unit(unit)

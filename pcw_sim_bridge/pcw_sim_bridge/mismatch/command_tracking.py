@@ -22,13 +22,22 @@ from pcw_description.effects.registry import all_effects, get
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
-from .regression_problem import BoolArray, Channel, FloatArray, LinearParameter, Nuisance, RegressionProblem, Shape, Term
+from .regression_problem import (
+    BoolArray,
+    Channel,
+    FloatArray,
+    LinearParameter,
+    Nuisance,
+    RegressionProblem,
+    Shape,
+    Term,
+)
 
 LARGEST_STEP = 1e-3  # [s] of the kernels
 LARGEST_GAP = 0.05  # [s]
 SHORTEST = 1.0  # [s]
 # Nobody knows how long a command was on its way within its own cycle: this part of a cycle either way.
-LATENCY_PART = 0.25
+LATENCY_PART = 0.1
 PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times

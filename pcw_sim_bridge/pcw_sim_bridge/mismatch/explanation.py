@@ -375,6 +375,8 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
         estimates = {}
         for offset, parameter_index in enumerate(instance.active):
             parameter = term.parameters[parameter_index]
+            if parameter.hidden:
+                continue
             value = float(fit.mean[position + offset])
             half = HALF_WIDTH * math.hypot(float(deviation[position + offset]), problem.scale_deviation * value)
             low, high = parameter.interval(value - half, value + half)

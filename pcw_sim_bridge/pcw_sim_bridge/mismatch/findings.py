@@ -284,7 +284,7 @@ class Findings:
     absent: tuple[tuple[str, str], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of report.json: INTERFACES section 6 and, added, retuned, ladder, absent, generated_effects, notes."""
+        """Return report.json: INTERFACES section 6 and, added, retuned, ladder, absent, generated_effects and notes."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,

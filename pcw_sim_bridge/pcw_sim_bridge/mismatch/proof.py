@@ -233,7 +233,7 @@ class Prover:
             instance = held_out.instances[index]
             term, values = problem.terms[instance.term], mean[slice(*held_out.span(index))]
             parameters = [term.parameters[k] for k in instance.active]
-            found = {p.name: p.value(float(value)) for p, value in zip(parameters, values, strict=True)}
+            found = {p.name: p.value(float(value)) for p, value in zip(parameters, values, strict=True) if not p.hidden}
             effects.append(effect_instance(term.effect, term.target, dict(instance.shape) | found, term.axis))
         numbers = {
             nuisance.name: nuisance.nominal + float(change)
@@ -328,6 +328,30 @@ class Prover:
                 pooled, floor = errors.pooled(), float(np.sqrt(np.mean(floors[h, errors.judged])))
                 gap = float(gap_closed(np.sqrt(pooled.before), np.sqrt(pooled.after), floor)[0])
         return tuple(found), gap
+
+
+def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFinding:
+    """Return the finding with further channels in its errors and in the gap that is closed."""
+    if not more:
+        return finding
+    channels = (*finding.channels, *more)
+
+    def together(values: Sequence[float]) -> float:
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    before, after = together([c.before for c in channels]), together([c.after for c in channels])
+    floor = together([c.floor for c in channels])
+    worst = max(more, key=lambda c: c.after / max(c.before, 1e-300))
+    grown = worst.after / max(worst.before, 1e-300) - 1.0 if worst.after_ci95[0] > worst.before_ci95[1] else 0.0
+    return dataclasses.replace(
+        finding,
+        inverse_nrmse=(before, after),
+        inverse_floor=floor,
+        gap_closed=float(gap_closed(np.array(before), np.array(after), floor)),
+        channels=channels,
+        harm=max(finding.harm, grown),
+        harm_at=worst.name if grown > finding.harm else finding.harm_at,
+    )
 
 
 def _busy(explanation: Explanation) -> np.ndarray:

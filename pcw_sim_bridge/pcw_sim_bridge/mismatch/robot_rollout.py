@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pcw_description.effects.kinds import EncoderEffect
+from pcw_description.effects.kinds import ActuatorEffect, EncoderEffect
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
@@ -215,7 +215,9 @@ def _simulated(robot: RobotDescription, part: RobotPart) -> FloatArray:
     motion = true_motion(robot, part.motion)
     own = ModelNumbers.of(as_it_really_is(robot))
     substeps = int(np.ceil(1.0 / (motion.rate * STEP) - 1e-6))
-    plant = ReducedPlant(robot, 1.0 / (motion.rate * substeps))
+    # The torques were measured behind whatever happens to the commands.
+    behind = tuple(i for i in robot.physics if not isinstance(get(i.name), ActuatorEffect))
+    plant = ReducedPlant(dataclasses.replace(robot, physics=behind), 1.0 / (motion.rate * substeps))
     lead, last = part.lead, part.marks[-1]
     rows, _ = rows_of(part.starts - lead, np.arange(lead + last), len(motion.time))
     first = np.stack([part.starts - lead, part.starts], axis=1)

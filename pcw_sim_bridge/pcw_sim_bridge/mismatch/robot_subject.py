@@ -16,6 +16,7 @@ from pcw_description.robot_description import DRIVE, STEER, Caster, RobotDescrip
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
 from ..plants.true_robot import as_it_really_is
+from .command_tracking import command_problems
 from .errors import MismatchError
 from .findings import InputFinding
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
@@ -108,6 +109,10 @@ class RobotSubject:
         except MismatchError as error:
             told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
             raise MismatchError("; ".join((str(error), *told))) from None
+
+    def command_problems(self, opened: Sequence[Opened]) -> Sequence[RegressionProblem]:
+        """Return one problem per joint whose torque commands and torques were recorded."""
+        return command_problems(self._seen_robot(), [o.recording for o in opened])
 
     def unit(self, unit: str) -> str:
         """Return a unit as it is."""

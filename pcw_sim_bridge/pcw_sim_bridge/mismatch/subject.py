@@ -40,6 +40,9 @@ class Subject(Protocol):
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem of recordings; later calls keep the filters that the first one chose."""
 
+    def command_problems(self, opened: Sequence[Opened]) -> Sequence[RegressionProblem]:
+        """Return one problem per joint between its commands and its torques; none where nothing was commanded."""
+
     def unit(self, unit: str) -> str:
         """Return a unit of the vocabulary as it is here (a linear axis has N for N m)."""
 

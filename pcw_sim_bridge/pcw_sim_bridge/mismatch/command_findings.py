@@ -1,0 +1,142 @@
+"""What the command channels of a robot say: each joint searched on its own, and proved on what it has not seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pcw_description.effect_instance import EffectInstance
+
+from .evidence_selection import EffectSearch, SelectionSettings
+from .explanation import Explanation, NamedTerm, explain
+from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
+from .open_set import Leftover
+from .paired_errors import PairedErrors, blocks_of, interval
+from .proof import effect_instance
+from .regression_problem import FloatArray, RegressionProblem
+
+Progress = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandFindings:
+    """Findings of all joints.
+
+    Attributes:
+        named: effects between commands and torques, each with what it is in a description.
+        proofs: held-out errors of every channel.
+    """
+
+    channels: tuple[ChannelFinding, ...] = ()
+    named: tuple[tuple[NamedTerm, EffectInstance], ...] = ()
+    leftovers: tuple[Leftover, ...] = ()
+    locations: tuple[LocationFinding, ...] = ()
+    proofs: tuple[ChannelProof, ...] = ()
+    ladder: tuple[LadderFinding, ...] = ()
+
+
+def command_findings(
+    problems: Sequence[RegressionProblem],
+    held_out: Sequence[RegressionProblem],
+    seed: int,
+    settings: SelectionSettings | None,
+    progress: Progress,
+) -> CommandFindings:
+    """Search every joint for what happens between its command and its torque.
+
+    Args:
+        problems: one per joint, of the fitted recordings.
+        held_out: the same of others; may be empty.
+        seed: of surrogates and bootstrap.
+        settings: of the search.
+        progress: is told what is named.
+    """
+    others = {problem.channels[0].name: problem for problem in held_out}
+    found = CommandFindings()
+    for problem in problems:
+        rng = np.random.default_rng(seed)
+        channel = problem.channels[0]
+        explanation = None if _is_idle(problem, settings) else explain(problem, rng, settings)
+        added, floor = np.zeros_like(problem.residual), _size(problem.residual)
+        flagged = False
+        if explanation is not None:
+            added = _predicted(problem, problem, explanation)
+            floor = float(explanation.floor[0])
+            flagged = bool(explanation.named or explanation.leftovers)
+            for named in explanation.named:
+                progress(f"{channel.name}: {explanation.search.label(named.instance)}")
+        p_value = 1.0 if explanation is None else float(explanation.p_values[0])
+        finding = ChannelFinding(channel.name, channel.unit, _size(problem.residual), floor, p_value, flagged)
+        other = others.get(channel.name)
+        proof = (
+            _proof(problem, added, floor, rng) if other is None
+            else _proof(other, _predicted(problem, other, explanation), floor, rng)
+        )
+        found = CommandFindings(
+            (*found.channels, finding),
+            (*found.named, *(_with_instance(named) for named in (explanation.named if explanation else ()))),
+            (*found.leftovers, *(explanation.leftovers if explanation else ())),
+            (*found.locations, *(_location(problem, named) for named in (explanation.named if explanation else ()))),
+            (*found.proofs, proof),
+            (*found.ladder, *_ladder(explanation)),
+        )
+    return found
+
+
+def _is_idle(problem: RegressionProblem, settings: SelectionSettings | None) -> bool:
+    """Whether no candidate gains anything over noise as it is, at a first look."""
+    search = EffectSearch(problem, np.random.default_rng(0), settings)
+    best = search.whiten_at(problem.residual).scan(())[0]
+    return not best or best[0].gain < search.settings.lenient_gain
+
+
+def _size(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _predicted(fitted: RegressionProblem, problem: RegressionProblem, explanation: Explanation | None) -> FloatArray:
+    """What the named effects, and the numbers re-tuned beside them, add in a problem of the same joint (T, 1)."""
+    total = np.zeros_like(problem.residual)
+    if explanation is None or not explanation.named:
+        return total
+    fit = explanation.fit
+    total += problem.nuisance_columns() @ fit.mean[: len(problem.nuisances)]
+    position = len(fitted.nuisances)
+    for instance in fit.instances:
+        if instance.term < len(problem.terms):
+            columns = problem.terms[instance.term].columns(dict(instance.shape))[..., list(instance.active)]
+            total += columns @ fit.mean[position : position + len(instance.active)]
+        position += len(instance.active)
+    return total
+
+
+def _proof(problem: RegressionProblem, added: FloatArray, floor: float, rng: np.random.Generator) -> ChannelProof:
+    spread = max(float(np.std(problem.measured)), 1e-300)
+    squares = [((values / spread) ** 2) for values in (problem.residual, problem.residual - added)]
+    errors = PairedErrors.of(squares[0], squares[1], blocks_of(problem.recording, problem.time), rng)
+    before, after = (float(np.sqrt(values[0])) for values in (errors.before, errors.after))
+    intervals = (interval(np.sqrt(draws[:, 0])) for draws in (errors.before_draws, errors.after_draws))
+    return ChannelProof(problem.channels[0].name, floor / spread, before, after, *intervals)
+
+
+def _with_instance(named: NamedTerm) -> tuple[NamedTerm, EffectInstance]:
+    values = {name: estimate.value for name, estimate in named.estimates.items()}
+    return named, effect_instance(named.term.effect, named.term.target, values, named.term.axis)
+
+
+def _location(problem: RegressionProblem, named: NamedTerm) -> LocationFinding:
+    channel = problem.channels[0]
+    first = problem.time[problem.recording == problem.recording[0]]
+    whole = ((float(first.min()), float(first.max())),)
+    return LocationFinding((channel.name,), channel.casters, channel.axis, whole, {})
+
+
+def _ladder(explanation: Explanation | None) -> tuple[LadderFinding, ...]:
+    if explanation is None:
+        return ()
+    return tuple(
+        LadderFinding(step.description, step.gain, step.held_out_gain, step.outcome)
+        for step in explanation.selection.ladder if step.outcome == "named"
+    )
