@@ -318,14 +318,14 @@ class OpenSetTest:
         valid = self.problem.valid[:, channel]
         if not valid.any():
             return None
-        signal = float(np.std(self.problem.measured[valid, channel]))
+        smallest = SMALLEST_PART * float(np.std(self.problem.measured[valid, channel]))
+        if self.problem.misjudged is not None:  # what the model cannot judge is no finding either
+            smallest = max(smallest, float(np.sqrt(np.mean(self.problem.misjudged[valid, channel] ** 2))))
         for name in self._promising(channel):
             functions, knots = self.bases[channel, name]
             gain, share, curve = self._dependence(channel, name, functions, knots, instances)
             size = np.sqrt(share) * float(np.sqrt(np.mean(self.residual[valid, channel] ** 2)))
-            passes = (
-                gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE and size > SMALLEST_PART * signal
-            )
+            passes = gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE and size > smallest
             if passes and (best is None or gain > best.gain):
                 best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
         return best

@@ -27,6 +27,7 @@ def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) ->
         # A drive reports the torque of some instant within its own cycle; nobody knows which.
         sampling = max(motion.sampling for motion in differences.motions)
         found.append(_nuisance(differences, "torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
+    found += _suspension(robot, differences)
     deviations = list(_geometry(robot))
     if layout.balanced:
         deviations += _dynamics(robot, differences.model.numbers)
@@ -90,6 +91,24 @@ def _gain(index: int, axis: int) -> Vary:
         numbers.gain -= step / numbers.gain.size
 
     return vary
+
+
+def _suspension(robot: RobotDescription, differences: ChannelDifferences) -> list[Nuisance]:
+    """How far the chassis leans on its springs when it accelerates: anything between not at all and twice as described.
+
+    A force m a at the height h tilts it by m a h / (k sum x^2), and moves the centre of mass by that tilt times h.
+    """
+    layout, numbers = differences.model.layout, differences.model.numbers
+    if not (layout.balanced or layout.imu):
+        return []
+    found = []
+    for k, axis in enumerate("xy"):
+        arms = numbers.steer_axis[:, k] - numbers.steer_axis[:, k].mean()
+        stiffness = robot.wheel_suspension.stiffness * float(np.sum(arms**2))
+        if stiffness > 0.0:
+            lean = numbers.total_mass * numbers.height_of_mass**2 / stiffness
+            found.append(_nuisance(differences, f"suspension.lean.{axis}", "s^2", 0.0, lean, _entry("lean", k)))
+    return found
 
 
 def _geometry(robot: RobotDescription) -> Iterator[Deviation]:

@@ -126,6 +126,8 @@ class ModelNumbers:
         imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
         tyres: numbers of the tyres (n, TYRE_SIZE); softness: slip at the contact per slip of these (n, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
+        lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
+            chassis leans on its springs (2,) [s^2].
     """
 
     chassis: FloatArray
@@ -143,6 +145,17 @@ class ModelNumbers:
     tyres: FloatArray
     softness: FloatArray
     torque_lag: float
+    lean: FloatArray
+
+    @property
+    def total_mass(self) -> float:
+        """Chassis and modules [kg]."""
+        return float(self.chassis[0] + self.modules[:, 0].sum())
+
+    @property
+    def height_of_mass(self) -> float:
+        """Height of the common centre of mass [m], the modules' at their axles."""
+        return float(self.chassis[0] * self.com_height + self.modules[:, 0] @ self.radius) / self.total_mass
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelNumbers:
@@ -165,6 +178,7 @@ class ModelNumbers:
             tyres=np.array([tyre_parameters(tyre) for tyre in robot.tyres]),
             softness=np.ones((robot.n, 2)),
             torque_lag=0.0,
+            lean=np.zeros(2),
         )
 
 
@@ -313,15 +327,13 @@ def _normal_forces(mass, com_x, com_y, com_z, steer_axis, caster_offset, steer_a
 def normal_forces(numbers: ModelNumbers, steer_angle: FloatArray, acceleration: FloatArray) -> FloatArray:
     """Quasi-static normal forces (T, n) [N] on the wheels under accelerations (T, 2 or more) in base_link."""
     chassis, modules = numbers.chassis, numbers.modules
-    module_mass = modules[:, 0].sum()
-    mass = chassis[0] + module_mass
+    mass = numbers.total_mass
     centre = (chassis[0] * chassis[1:3] + (modules[:, :1] * numbers.steer_axis).sum(axis=0)) / mass
-    height = (chassis[0] * numbers.com_height + (modules[:, 0] * numbers.radius).sum()) / mass
     forces: FloatArray = _normal_forces(
         mass,
         centre[0],
         centre[1],
-        height,
+        numbers.height_of_mass,
         numbers.steer_axis,
         numbers.caster_offset,
         steer_angle,
@@ -387,6 +399,13 @@ def inertial_wrench(
         numbers.chassis, numbers.modules, numbers.steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
     )
     return wrench
+
+
+def _leaning(numbers: ModelNumbers, twist: FloatArray, twist_dot: FloatArray) -> FloatArray | None:
+    """How far the centre of mass is behind a rigid body's (T, 2) [m]; None for a rigid body."""
+    if not numbers.lean.any():
+        return None
+    return numbers.lean * acceleration_of(twist, twist_dot)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -460,12 +479,16 @@ def channel_sides(
     slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, slip)
     twist = state.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)
+    leaning = _leaning(numbers, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
         measured.append(
             _wrench_of(numbers.steer_axis, numbers.caster_offset, state.steer_angle, state.force, state.spin)
         )
-        predicted.append(inertial_wrench(numbers, motion, state.steer_angle, twist, twist_dot))
+        wrench = inertial_wrench(numbers, motion, state.steer_angle, twist, twist_dot)
+        if leaning is not None:
+            wrench[:, :2] -= numbers.total_mass * derivative(derivative(leaning, motion.rate), motion.rate)
+        predicted.append(wrench)
     measured.append(state.contradiction.reshape(len(twist), -1))
     predicted.append(slip_contradiction.reshape(len(twist), -1))
     if layout.imu:
@@ -475,7 +498,11 @@ def channel_sides(
         rate = numbers.gyro_scale * omega + numbers.gyro_bias
         along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x + numbers.accelerometer_bias[0]
         across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y + numbers.accelerometer_bias[1]
-        predicted.append(np.stack([rate, along, across], axis=1))
+        sensed = np.stack([rate, along, across], axis=1)
+        if leaning is not None:
+            # A sensor that leans back feels a part of its weight.
+            sensed[:, 1:] += GRAVITY / numbers.height_of_mass * leaning
+        predicted.append(sensed)
     if layout.pose:
         measured.append(motion.tracked_twist)
         predicted.append(twist)
