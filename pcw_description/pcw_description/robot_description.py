@@ -259,6 +259,8 @@ DEFAULT_TOLERANCES: Mapping[str, Tolerance] = {
     "contact.stiffness_spread": Tolerance(0.1, "1", False),
     # What passes for a level floor: 2 mm in a metre.
     "ground.slope": Tolerance(0.002, "rad", False),
+    # Stamps of other sensors than the encoders': a bus and a driver are between them.
+    "clock.offset": Tolerance(0.001, "s", False),
     "imu.position": Tolerance(0.005, "m", False),
     "imu.gyro_bias": Tolerance(0.002, "rad/s", False),
     "imu.accelerometer_bias": Tolerance(0.05, "m/s^2", False),

@@ -240,7 +240,9 @@ def _ladder(steps: Sequence[LadderStep]) -> tuple[LadderFinding, ...]:
 
 def _traces(problem: RegressionProblem, explained: FloatArray, fit: Fit, role: str) -> tuple[Trace, ...]:
     """One trace per channel, over all recordings on end, against the variable that tells most."""
-    instance_arguments = [name for i in fit.instances for name in problem.terms[i.term].arguments]
+    # A law outside the library is a term of the fitted problem alone.
+    terms = [problem.terms[i.term] for i in fit.instances if i.term < len(problem.terms)]
+    instance_arguments = [name for term in terms for name in term.arguments]
     wanted = [name for name in (*instance_arguments, "velocity", "speed", "time") if name in problem.variables]
     variable = wanted[0] if wanted else next(iter(problem.variables))
     time_on_end = _on_end(problem)

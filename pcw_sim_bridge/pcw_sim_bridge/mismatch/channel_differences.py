@@ -93,3 +93,12 @@ class ChannelDifferences:
                 self.filtered([np.where(known[:, :, None], -r.apply(t[..., some]), 0.0) for r, known, t in pairs])
             )
         return np.concatenate(parts, axis=2)
+
+    def of_unit_torque(self, i: int, axis: int) -> FloatArray:
+        """What a constant torque at one joint adds to the residual (T, C), per N m."""
+        torques = []
+        for motion in self.motions:
+            torque = np.zeros((*motion.torque.shape, 1))
+            torque[:, i, axis] = 1.0
+            torques.append(torque)
+        return self.of_torque(torques)[:, :, 0]

@@ -127,7 +127,9 @@ class EffectSearch:
         for channel in range(residual.shape[1]):
             values = residual[:, channel]
             deviation = robust_deviation(values[problem.valid[:, channel]])
-            weights[:, channel] = problem.channels[channel].information * huber_weights(values / deviation)
+            # What is large at the first look may be an event, which held down like an outlier would never be found.
+            robust = 1.0 if by_channel else huber_weights(values / deviation)
+            weights[:, channel] = problem.channels[channel].information * robust
             if problem.misjudged is not None:
                 weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
         return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)

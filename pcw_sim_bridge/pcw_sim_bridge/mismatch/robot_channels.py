@@ -17,11 +17,12 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDes
 from ..plants.true_robot import as_it_really_is
 from .channel_differences import ChannelDifferences
 from .errors import MismatchError
-from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites
+from .first_look import remainder
+from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, Term
 from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
 from .robot_nuisances import robot_nuisances
-from .robot_terms import robot_terms
+from .robot_terms import Looked, robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, twists
 from .signal_filter import SignalFilter
 
@@ -89,19 +90,28 @@ class RobotProblemBuilder:
         """
         differences = ChannelDifferences(self.model, self.motions, self.filters)
         along = self._along_motions(differences) if with_terms else {}
+        valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
         stamps = [f.decimate(m.time) for f, m in zip(self.filters, self.motions, strict=True)]
-        numbers = [m.recording for m in self.motions]
+        time = np.concatenate(stamps)
+        segment = np.concatenate([np.full(len(t), i) for i, t in enumerate(stamps)])
+        recording = np.array([motion.recording for motion in self.motions])[segment]
+        rate = float(np.mean([f.decimated_rate for f in self.filters]))
+        terms: tuple[Term, ...] = ()
+        if with_terms:
+            angle = differences.filtered([motion.position for motion in self.motions])
+            left = remainder(differences.residual, valid, nuisances)
+            terms = tuple(robot_terms(self.robot, differences, Looked(left, rate, angle)))
         return RegressionProblem(
             channels=self.channels(),
-            time=np.concatenate(stamps),
-            segment=np.concatenate([np.full(len(t), i) for i, t in enumerate(stamps)]),
-            recording=np.concatenate([np.full(len(t), k) for t, k in zip(stamps, numbers, strict=True)]),
-            rate=float(np.mean([f.decimated_rate for f in self.filters])),
+            time=time,
+            segment=segment,
+            recording=recording,
+            rate=rate,
             measured=differences.measured,
             residual=differences.residual,
-            valid=self._valid(differences),
-            nuisances=tuple(robot_nuisances(self.robot, differences)),
-            terms=tuple(robot_terms(self.robot, differences)) if with_terms else (),
+            valid=valid,
+            nuisances=nuisances,
+            terms=terms,
             variables=self._variables(along),
             misjudged=self._misjudged(differences),
             scale_deviation=self._scale_deviation(),

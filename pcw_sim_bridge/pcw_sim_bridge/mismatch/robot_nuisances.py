@@ -34,6 +34,9 @@ def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) ->
     deviations += _tyres(robot)
     if layout.imu:
         deviations += _inertial_sensor()
+    for k, (sensor, there) in enumerate((("imu", layout.imu), ("tracker", layout.pose))):
+        if there:
+            deviations.append(("clock.offset", f"clock.offset.{sensor}", 0.0, _entry("clock", k)))
     for tolerance, label, nominal, vary in deviations:
         known = robot.tolerance(tolerance)
         deviation = known.value * abs(nominal) if known.relative else known.value

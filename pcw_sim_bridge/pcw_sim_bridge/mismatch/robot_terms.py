@@ -7,6 +7,7 @@ are searched on a grid where there is one to search on; everything else is left 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
@@ -27,6 +28,7 @@ from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
 from .axis_channels import kernel_arguments
 from .channel_differences import ChannelDifferences
+from .first_look import Chosen, orders
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
@@ -37,16 +39,30 @@ VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
 _ARGUMENT_NAMES = {"position": "angle", "velocity": "velocity", "force": "torque", "normal_force": "normal_force"}
 
 
-def robot_terms(robot: RobotDescription, differences: ChannelDifferences) -> list[Term]:
-    """Return all candidates whose effects show in the channels."""
-    return _TermMaker(robot, differences).terms()
+def robot_terms(robot: RobotDescription, differences: ChannelDifferences, looked: Looked) -> list[Term]:
+    """Return all candidates whose effects show in the channels; `looked` is what a first look needs."""
+    return _TermMaker(robot, differences, looked).terms()
+
+
+@dataclasses.dataclass(frozen=True)
+class Looked:
+    """The residual as a first look sees it.
+
+    Attributes:
+        left: over its noise, tolerances fitted (T, C); rate: samples per second.
+        angle: of every joint (T, n, 2) [rad].
+    """
+
+    left: FloatArray
+    rate: float
+    angle: FloatArray
 
 
 class _TermMaker:
     """Makes the candidates of one problem."""
 
-    def __init__(self, robot: RobotDescription, differences: ChannelDifferences) -> None:
-        self.robot, self.differences = robot, differences
+    def __init__(self, robot: RobotDescription, differences: ChannelDifferences, looked: Looked) -> None:
+        self.robot, self.differences, self.looked = robot, differences, looked
         self.layout = differences.model.layout
 
     def terms(self) -> list[Term]:
@@ -70,8 +86,10 @@ class _TermMaker:
     # -- torques on joints --------------------------------------------------------------------------------------
 
     def _joint_term(self, effect: JointTorqueEffect, target: tuple[str, ...], axis: str | None) -> Term | None:
-        shapes = self._speed_shapes(effect)
-        if not self.layout.balanced or shapes is None:
+        if not self.layout.balanced:
+            return None
+        shapes, among = self._shapes(effect, target, axis)
+        if not shapes:
             return None
 
         def columns(shape: Shape) -> FloatArray:
@@ -99,7 +117,9 @@ class _TermMaker:
             shapes=shapes,
             columns=columns,
             arguments=tuple(f"{axis or effect.axis}_{argument}/{name}" for argument in arguments for name in target),
-            resolution={p.name: ("log", 2.15) for p in effect.nonlinear_parameters if p.default is None},
+            resolution={p.name: _spacing(p, self.looked) for p in effect.nonlinear_parameters if p.default is None},
+            repeatable=among > 0,
+            grid_size=among,
         )
 
     def _joint_columns(
@@ -118,10 +138,12 @@ class _TermMaker:
             torques.append(found)
         return self.differences.of_torque(torques)
 
-    def _speed_shapes(self, effect: JointTorqueEffect) -> tuple[dict[str, float], ...] | None:
-        """Grid of an effect's shaping parameters, or None for effects whose search does not pay on a rolling robot."""
+    def _shapes(
+        self, effect: JointTorqueEffect, target: Sequence[str], axis_name: str | None
+    ) -> tuple[tuple[dict[str, float], ...], int]:
+        """Grid of an effect's shaping parameters, and how many it was chosen from; empty where there is none to search on."""
         shapes: list[dict[str, float]] = [{}]
-        axis = AXIS_NAMES.index(effect.axis)
+        axis, among = AXIS_NAMES.index(axis_name or effect.axis), 0
         speeds = np.concatenate([np.abs(motion.velocity[:, :, axis]).ravel() for motion in self.differences.motions])
         top = float(np.quantile(speeds, 0.98))
         for parameter in effect.nonlinear_parameters:
@@ -129,10 +151,19 @@ class _TermMaker:
                 values = [parameter.default]
             elif parameter.unit == "rad/s":
                 values = [float(value) for value in np.geomspace(0.05, 0.5, 4) * top]
+            elif parameter.unit == "1/rad" and len(target) == 1:  # every motor has its own phase
+                chosen = self._orders(self.robot.caster_index(target[0]), axis)
+                values, among = [float(value) for value in chosen.values], chosen.among
             else:
-                return None
+                return (), 0
             shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
-        return tuple(shapes)
+        return tuple(shapes), among * max(len(shapes), 1)
+
+    def _orders(self, i: int, axis: int) -> Chosen:
+        """Orders of the ripples that a torque at one joint would have to have, to be in what is left."""
+        response = self.differences.of_unit_torque(i, axis)
+        signal = np.sum(self.looked.left[:, :3] * response[:, :3], axis=1)
+        return orders(signal, self.looked.angle[:, i, axis], self.looked.rate)
 
     # -- everything else ----------------------------------------------------------------------------------------
 
@@ -213,6 +244,13 @@ class _TermMaker:
                 return None
             shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
         return tuple(shapes), resolution
+
+
+def _spacing(parameter: EffectParameter, looked: Looked) -> tuple[str, float]:
+    """Spacing of the grid of a shaping parameter."""
+    if parameter.unit == "1/rad":
+        return "linear", math.pi / (2.0 * max(float(np.ptp(looked.angle.reshape(len(looked.angle), -1), axis=0).max()), 1.0))
+    return "log", 2.15
 
 
 def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:

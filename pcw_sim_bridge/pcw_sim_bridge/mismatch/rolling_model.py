@@ -126,6 +126,7 @@ class ModelNumbers:
         imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
         tyres: numbers of the tyres (n, TYRE_SIZE); softness: slip at the contact per slip of these (n, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
+        clock: how much later than the joints' the stamps of IMU and tracker are (2,) [s].
         lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
             chassis leans on its springs (2,) [s^2].
     """
@@ -145,6 +146,7 @@ class ModelNumbers:
     tyres: FloatArray
     softness: FloatArray
     torque_lag: float
+    clock: FloatArray
     lean: FloatArray
 
     @property
@@ -178,6 +180,7 @@ class ModelNumbers:
             tyres=np.array([tyre_parameters(tyre) for tyre in robot.tyres]),
             softness=np.ones((robot.n, 2)),
             torque_lag=0.0,
+            clock=np.zeros(2),
             lean=np.zeros(2),
         )
 
@@ -494,7 +497,8 @@ def channel_sides(
     if layout.imu:
         x, y = numbers.imu_position
         omega, alpha = twist[:, 2], twist_dot[:, 2]
-        measured.append(motion.imu)
+        late = numbers.clock[0] * derivative(motion.imu, motion.rate) if numbers.clock[0] else 0.0
+        measured.append(motion.imu + late)
         rate = numbers.gyro_scale * omega + numbers.gyro_bias
         along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x + numbers.accelerometer_bias[0]
         across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y + numbers.accelerometer_bias[1]
@@ -504,6 +508,7 @@ def channel_sides(
             sensed[:, 1:] += GRAVITY / numbers.height_of_mass * leaning
         predicted.append(sensed)
     if layout.pose:
-        measured.append(motion.tracked_twist)
+        late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0
+        measured.append(motion.tracked_twist + late)
         predicted.append(twist)
     return np.concatenate(measured, axis=1), np.concatenate(predicted, axis=1)

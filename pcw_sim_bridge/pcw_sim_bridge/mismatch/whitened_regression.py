@@ -216,6 +216,7 @@ class WhitenedRegression:
             self.target[piece] *= factor
             self.nuisance[piece] *= factor
         self._bank.rescale(factors)
+        self._long_scans.clear()
 
     def block_labels(self) -> list[int]:
         """Labels of the blocks that hold usable rows, in the order of `blocks`."""
