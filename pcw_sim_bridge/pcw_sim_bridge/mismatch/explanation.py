@@ -142,12 +142,13 @@ def explain(
 ) -> Explanation:
     """Search, test what is left, refine; see the module."""
     search = EffectSearch(problem, rng, settings, progress)
-    judgement = judge(search, _with_whole_numbers(search, search.run()))
-    search, selection, result = judgement.search, judgement.selection, judgement.result
-    problem = search.problem
+    selection = _with_whole_numbers(search, search.run())
+    result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
     suspect: Refinement | None = None
     undecided: dict[Instance, float] = {}
     remarks: tuple[str, ...] = ()
+    # A refined law of the library comes before any law outside it: what a friction that differs between directions explains
+    # is no unknown function of the speed.
     refined = _refined(search, selection, result)
     if refined is not None:
         finished = OpenSetTest(search, refined.instances).run(selection.threshold)
@@ -156,12 +157,13 @@ def explain(
         if not finished.vetoed and not {left.variable for left in finished.leftovers} & set(arguments):
             progress(f"refined: {search.label(refined.instances[refined.position])}, {refined.gain:.1f} nats")
             remarks = _remarks(search, selection, refined)
-            laws = tuple(left for left in result.leftovers if left.law is not None)
-            result = dataclasses.replace(finished, leftovers=(*laws, *finished.leftovers))
             selection, undecided = better, refined.undecided
         else:
             suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
             progress(f"not adopted: {suspect.describe()}")
+    judgement = judge(search, selection)
+    search, selection, result = judgement.search, judgement.selection, judgement.result
+    problem = search.problem
     named = tuple(
         dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
         for entry in named_terms(search, selection)
