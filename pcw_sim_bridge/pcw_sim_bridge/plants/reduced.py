@@ -20,12 +20,15 @@ second order.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import scrub_torque, slip_under_load, tyre_step_with_slopes
+from pcw_description.differential_kinematics import forward_kinematics_kernel
 from pcw_description.effects.kinds import (
     CONTACT_RESULTS,
     FORCE_INPUTS,
@@ -72,7 +75,7 @@ from .caster_arrays import (
     caster_numbers,
 )
 from .drivetrain import joint_torques, motor_torques, turn_motors
-from .effect_tables import EffectTables
+from .effect_tables import ANGLE, RATE, EffectTables
 from .plant import PlantError, PlantState, gravity_in_base
 from .support_forces import support_forces
 from .surroundings import chassis_wrench, ground_under
@@ -309,6 +312,74 @@ def _advance(  # type: ignore[no-untyped-def]
     return True
 
 
+@compiled
+def _set_motion(body, wheels, effects, twist, position, velocity):  # type: ignore[no-untyped-def]
+    """Set the motion of the body and of the wheels, motors behind gears as rigid gears would have them."""
+    body[_VX : _OMEGA + 1] = twist
+    for i in range(len(wheels)):
+        for axis in range(2):
+            wheels[i, RHO + axis] = position[i, axis]
+            wheels[i, RHO_DOT + axis] = velocity[i, axis]
+            first, second = effects.coupling[i, axis, 0], effects.coupling[i, axis, 1]
+            effects.gear_state[i, axis, ANGLE] = first * position[i, 0] + second * position[i, 1]
+            effects.gear_state[i, axis, RATE] = first * velocity[i, 0] + second * velocity[i, 1]
+
+
+@compiled
+def _roll_out(  # type: ignore[no-untyped-def]
+    steps, dt, chassis, casters, gravity, effects, torque, lead, marks, time, pose, twist, position, velocity, bodies, joints
+):
+    """Fill bodies (W, K, 6) and joints (W, K, n, 4) of `ReducedPlant.roll_out`; False if a torque is not finite."""
+    windows, rows, n, _ = torque.shape
+    body, wheels, restart = np.empty(10), np.empty((n, WHEEL_STATE)), np.empty(3)
+    axis, offset = casters[:, SX : SY + 1].copy(), casters[:, BX : BY + 1].copy()
+    radius = casters[:, RADIUS].copy()
+    for w in range(windows):
+        body[:] = 0.0
+        wheels[:] = 0.0
+        effects.memory[:] = 0.0
+        effects.gear_state[:] = 0.0
+        body[_X : _YAW + 1] = pose[w, 0]
+        body[_TIME] = time[w]
+        _set_motion(body, wheels, effects, twist[w, 0], position[w, 0], velocity[w, 0])
+        mark = 0
+        for row in range(rows + 1):
+            if row == lead and lead > 0:
+                rolled, _, _ = forward_kinematics_kernel(
+                    axis, offset, radius, wheels[:, PHI].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
+                )
+                restart[:] = twist[w, 1] + body[_VX : _OMEGA + 1] - rolled
+                body[_X : _YAW + 1] = pose[w, 1]
+                _set_motion(body, wheels, effects, restart, position[w, 1], velocity[w, 1])
+            if mark < len(marks) and row == lead + marks[mark]:
+                bodies[w, mark] = body[: _OMEGA + 1]
+                joints[w, mark] = wheels[:, RHO : PHI_DOT + 1]
+                mark += 1
+            if row == rows:
+                break
+            if not _advance(steps, dt, chassis, casters, gravity, effects, torque[w, row], body, wheels):
+                return False
+    return True
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowStarts:
+    """How the windows of a roll-out begin: W of them, each given at its first row [0] and where its lead ends [1].
+
+    Attributes:
+        time: of the first row (W,) [s].
+        pose: (W, 2, 3) of base_link in the world.
+        twist: (W, 2, 3) of base_link as its rolling wheels have it.
+        position, velocity: of the joints (W, 2, n, 2).
+    """
+
+    time: FloatArray
+    pose: FloatArray
+    twist: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+
+
 class ReducedPlant:
     """The reduced plant of one robot; see the module's docstring.
 
@@ -395,6 +466,39 @@ class ReducedPlant:
             contact_force=wheels[:, FX : FY + 1].copy(),
             normal_force=wheels[:, FZ].copy(),
         )
+
+    def roll_out(
+        self, torque: FloatArray, steps: int, starts: WindowStarts, lead: int, marks: Sequence[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Drive many short windows with recorded torques, compiled as one; the plant is at its reset state afterwards.
+
+        Over the first `lead` rows tyres take up their forces and actuators fill their memories. Then the motion is set
+        again, and what the wheels slipped by is kept.
+
+        Args:
+            torque: motor torques (W, L, n, 2) [N m], each row held for `steps` steps.
+            steps: steps of dt per row.
+            starts: of the windows.
+            lead: rows.
+            marks: rows after the lead at which the state is wanted (K,), increasing, at most L - lead.
+
+        Returns:
+            Pose and twist (W, K, 6), and joint positions and velocities (W, K, n, 2, 2), position first.
+
+        Raises:
+            PlantError: a torque is NaN or infinite.
+        """
+        windows, _, n, _ = torque.shape
+        bodies, joints = np.full((windows, len(marks), 6), np.nan), np.full((windows, len(marks), n, 4), np.nan)
+        fine = _roll_out(
+            steps, self.dt, self._chassis, self._casters, self._effects.gravity, self._effects.compiled,
+            np.ascontiguousarray(torque), lead, np.array(marks, dtype=np.int64), starts.time, starts.pose, starts.twist,
+            starts.position, starts.velocity, bodies, joints,
+        )  # fmt: skip
+        self.reset()
+        if not fine:
+            raise PlantError("torque holds NaN or infinity; allowed: finite torques in N m")
+        return bodies, joints.reshape(windows, len(marks), n, 2, 2)
 
     def close(self) -> None:
         """Free what the plant holds: nothing."""
