@@ -17,15 +17,15 @@ from pcw_description.axis_recording import (
     read_axis_recording,
 )
 from pcw_description.effect_instance import EffectInstance
-from pcw_description.effects.kinds import JointTorqueEffect
 from pcw_description.effects.registry import get
 
-from .axis_channels import AxisProblemBuilder, axis_motion
+from .axis_channels import AxisProblemBuilder
+from .axis_rollout import axis_windows, rollout_floor, rollout_squares
 from .findings import InputFinding
-from .regression_problem import RegressionProblem
+from .regression_problem import FloatArray, RegressionProblem
+from .rollout import Windows
 from .subject import Opened, file_digest
 
-ROLLOUT_WINDOW = 0.5  # [s]
 # Sentences name rotary units; on a linear axis the longest match is replaced first.
 _LINEAR_WORDS = ("N m s/rad", "rad/s", "1/rad", "N m")
 
@@ -99,56 +99,22 @@ class AxisSubject:
         """Return the description as it stands in a file."""
         return axis_to_mapping(self.axis)
 
-    def rollout(self, opened: Sequence[Opened]) -> dict[str, float]:
-        """Simulate position and speed from the measured force over windows, started at the measured state."""
-        errors, spreads = {"position": [], "velocity": []}, {"position": [], "velocity": []}  # type: ignore[var-annotated]
+    def path(self, opened: Opened) -> None:
+        """A bench axis goes nowhere."""
+
+    def absent(self, opened: Sequence[Opened]) -> tuple[tuple[str, str], ...]:
+        """Return nothing: without what an axis needs its recording is not read."""
+        return ()
+
+    def windows(self, opened: Sequence[Opened]) -> Windows | None:
+        """Return the windows to simulate."""
         assert self._cutoff is not None
-        for index, item in enumerate(opened):
-            rate, motions = axis_motion(self.axis, item.recording, index, self._cutoff)
-            length = int(ROLLOUT_WINDOW * rate)
-            for motion in motions:
-                starts = np.arange(0, len(motion.time) - length, length)
-                if not len(starts):
-                    continue
-                rows = starts[:, None] + np.arange(length)
-                position, velocity = self._simulate(
-                    motion.position[starts], motion.velocity[starts], motion.force[rows], rate
-                )
-                for name, simulated, truth in (
-                    ("position", position, motion.position[rows]),
-                    ("velocity", velocity, motion.velocity[rows]),
-                ):
-                    errors[name].append((simulated - truth).ravel())
-                    spreads[name].append((truth - truth[:, :1]).ravel())
-        return {name: _relative(errors[name], spreads[name]) for name in errors if errors[name]}
+        return axis_windows(self.axis, [o.recording for o in opened], self._cutoff)
 
-    def _simulate(
-        self, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rate: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Step all windows side by side: position, velocity (W,), force (W, L) -> both (W, L); friction implicit."""
-        axis, dt = self.axis, 1.0 / rate
-        q, v = position.copy(), velocity.copy()
-        positions, velocities = np.empty_like(force), np.empty_like(force)
-        zero = np.zeros_like(q)
-        nudge = 1e-6 * max(float(np.max(np.abs(velocity))), 1e-6)
-        for k in range(force.shape[1]):
-            positions[:, k], velocities[:, k] = q, v
-            total, slope = force[:, k].copy(), zero.copy()
-            if axis.gravity_arm is not None:
-                total -= axis.gravity_arm.moment * np.sin(q - axis.gravity_arm.hanging_position)
-            for instance in axis.physics:
-                effect = get(instance.name)
-                if isinstance(effect, JointTorqueEffect):
-                    here = effect.contribution(q, v, force[:, k], zero, instance.parameters)
-                    ahead = effect.contribution(q, v + nudge, force[:, k], zero, instance.parameters)
-                    total += here
-                    slope += np.maximum((here - ahead) / nudge, 0.0)
-            v = v + dt * total / (axis.inertia + dt * slope)
-            q = q + dt * v
-        return positions, velocities
+    def rollout(self, windows: Windows) -> FloatArray:
+        """Return the squared errors of position and speed under the measured force, (W, H, 2)."""
+        return rollout_squares(self.axis, windows)
 
-
-def _relative(errors: list[np.ndarray], spreads: list[np.ndarray]) -> float:
-    """Root mean square of errors over that of spreads."""
-    spread = float(np.mean(np.concatenate(spreads) ** 2))
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2) / max(spread, 1e-300)))
+    def rollout_floor(self, windows: Windows, rng: np.random.Generator) -> FloatArray:
+        """Return the squared errors that the noise of the sensors makes in it, (W, H, 2)."""
+        return rollout_floor(self.axis, windows, rng)

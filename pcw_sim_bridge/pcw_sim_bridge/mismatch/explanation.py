@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import stats
@@ -200,6 +200,21 @@ def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection
         if loss < AMBIGUOUS and not search.repeats(rounded, others):
             instances = trial
     return selection if instances == selection.fit.instances else search.conclude(instances, selection.threshold)
+
+
+def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
+    """Return the explanation by these effects alone: fitted again, and what is left tested again."""
+    search, threshold = explanation.search, explanation.selection.threshold
+    selection = search.conclude(instances, threshold)
+    result = OpenSetTest(search, selection.fit.instances).run(threshold)
+    return dataclasses.replace(
+        explanation,
+        selection=selection,
+        named=named_terms(search, selection),
+        leftovers=result.leftovers,
+        floor=result.floor,
+        p_values=_p_values(search, selection, result),
+    )
 
 
 def _doubted(entry: NamedTerm, rival: str, undecided: Mapping[Instance, float]) -> NamedTerm:

@@ -8,6 +8,8 @@ from typing import Any
 
 from .regression_problem import FloatArray
 
+Interval = tuple[float, float]
+
 FORMAT = "pcw_mismatch/1"
 VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
 
@@ -43,14 +45,30 @@ class ChannelFinding:
 
 
 @dataclasses.dataclass(frozen=True)
+class Place:
+    """A circle on the floor, in the frame of the tracker or of the odometry [m]."""
+
+    x: float
+    y: float
+    radius: float
+
+
+@dataclasses.dataclass(frozen=True)
 class LocationFinding:
-    """Where recordings and model part."""
+    """Where recordings and model part.
+
+    Attributes:
+        intervals: in the first recording that shows it [s].
+        region: range of each operating variable in which it shows.
+        place: on the floor, of what is tied to one.
+    """
 
     channels: tuple[str, ...]
     casters: tuple[str, ...]
     axis: str
     intervals: tuple[tuple[float, float], ...]
     region: Mapping[str, tuple[float, float]]
+    place: Place | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,20 +118,78 @@ class RetunedFinding:
 
 
 @dataclasses.dataclass(frozen=True)
+class ChannelProof:
+    """Held-out error of one channel over the spread of its measured side, with 95 % intervals; `floor` is its noise."""
+
+    name: str
+    floor: float
+    before: float
+    after: float
+    before_ci95: Interval
+    after_ci95: Interval
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutProof:
+    """Error of one signal at one horizon [s] of forward simulation, over the size of its changes, likewise."""
+
+    signal: str
+    horizon: float
+    floor: float
+    before: float
+    after: float
+    before_ci95: Interval
+    after_ci95: Interval
+
+
+@dataclasses.dataclass(frozen=True)
 class FitFinding:
     """Held-out errors before and after the patch.
 
     Attributes:
         source: what was held out, in words.
         inverse_nrmse: of the measured side of the channels, before and after.
-        rollout: of forward simulation, by signal.
-        gap_closed: (before - after) / (before - floor), the floor being noise; 0 where there is no gap.
+        rollout: of forward simulation over half a second, by signal.
+        gap_closed: (before - after) / (before - floor) of `inverse_nrmse`, the floor being noise; 0 where there is no gap.
+        gap_closed_ci95, inverse_ci95: 95 % intervals, the latter before and after; inverse_floor: what noise leaves.
+        channels: errors by channel; rollouts: by signal and horizon.
+        rollout_gap_closed: likewise of the simulation over half a second, all signals; None where nothing was simulated.
+        harm: the largest relative growth of the error of a channel, signal or recording that is no chance; where, in
+            `harm_at`.
     """
 
     source: str
     inverse_nrmse: tuple[float, float]
     rollout: Mapping[str, tuple[float, float]]
     gap_closed: float
+    gap_closed_ci95: Interval | None = None
+    inverse_ci95: tuple[Interval, Interval] | None = None
+    inverse_floor: float | None = None
+    channels: tuple[ChannelProof, ...] = ()
+    rollouts: tuple[RolloutProof, ...] = ()
+    rollout_gap_closed: float | None = None
+    harm: float = 0.0
+    harm_at: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return `fit.holdout` of report.json."""
+        return {
+            "source": self.source,
+            "inverse_nrmse": list(self.inverse_nrmse),
+            "inverse_ci95": None if self.inverse_ci95 is None else [list(pair) for pair in self.inverse_ci95],
+            "inverse_floor": self.inverse_floor,
+            "rollout": {name: list(pair) for name, pair in self.rollout.items()},
+            "gap_closed": self.gap_closed,
+            "gap_closed_ci95": None if self.gap_closed_ci95 is None else list(self.gap_closed_ci95),
+            "rollout_gap_closed": self.rollout_gap_closed,
+            "harm": self.harm,
+            "harm_at": self.harm_at,
+            "per_channel": [dataclasses.asdict(entry) for entry in self.channels],
+            "horizons": [
+                {"horizon_s": entry.horizon, **{k: v for k, v in dataclasses.asdict(entry).items() if k != "horizon"}}
+                for entry in self.rollouts
+            ],
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,8 +223,25 @@ class Trace:
 
 
 @dataclasses.dataclass(frozen=True)
+class ResidualMap:
+    """What is left of all channels together, over their noise, for the figures; arrays (T,).
+
+    Attributes:
+        before, after: root mean square over the channels of residual over floor, nominal and patched; NaN: not judged.
+        time: over all recordings on end [s]; variables: name -> values.
+        path: position on the floor (T, 2) [m]; None on a bench.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    time: FloatArray
+    variables: Mapping[str, FloatArray]
+    path: FloatArray | None
+
+
+@dataclasses.dataclass(frozen=True)
 class Findings:
-    """Everything an analysis says."""
+    """Everything an analysis says; `absent` is what was not recorded, and what that costs."""
 
     subject: str
     verdict: str
@@ -163,9 +256,11 @@ class Findings:
     traces: tuple[Trace, ...]
     notes: tuple[str, ...]
     seconds: float
+    residual_map: ResidualMap | None = None
+    absent: tuple[tuple[str, str], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of report.json (INTERFACES section 6; `retuned`, `ladder` and `notes` are additions)."""
+        """Return the content of report.json (INTERFACES section 6; added: `retuned`, `ladder`, `absent` and `notes`)."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,
@@ -181,7 +276,7 @@ class Findings:
                     "axis": place.axis,
                     "intervals_s": [list(interval) for interval in place.intervals],
                     "region": {name: list(span) for name, span in place.region.items()},
-                    "place_m": None,
+                    "place_m": None if place.place is None else dataclasses.asdict(place.place),
                 }
                 for place in self.locations
             ],
@@ -209,16 +304,7 @@ class Findings:
                 }
                 for leftover in self.unknown
             ],
-            "fit": {}
-            if self.fit is None
-            else {
-                "holdout": {
-                    "source": self.fit.source,
-                    "inverse_nrmse": list(self.fit.inverse_nrmse),
-                    "rollout": {name: list(pair) for name, pair in self.fit.rollout.items()},
-                    "gap_closed": self.fit.gap_closed,
-                }
-            },
+            "fit": {} if self.fit is None else {"holdout": self.fit.to_json()},
             "retuned": [
                 {
                     "name": r.name, "unit": r.unit, "nominal": r.nominal, "value": r.value, "ci95": [r.low, r.high],
@@ -227,6 +313,7 @@ class Findings:
                 for r in self.retuned
             ],
             "ladder": [dataclasses.asdict(step) for step in self.ladder],
+            "absent": [{"sensor": sensor, "cost": cost} for sensor, cost in self.absent],
             "notes": list(self.notes),
             "seconds": self.seconds,
         }

@@ -12,23 +12,21 @@ import numpy as np
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
-from pcw_description.robot_description import STEER, RobotDescription
+from pcw_description.robot_description import DRIVE, STEER, Caster, RobotDescription
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
-from ..plants.reduced import ReducedPlant
 from ..plants.true_robot import as_it_really_is
 from .errors import MismatchError
 from .findings import InputFinding
-from .regression_problem import RegressionProblem
-from .robot_channels import RobotProblemBuilder
-from .robot_effects import without_reading_errors
-from .robot_motion import choose_cutoff, read_motions
+from .regression_problem import BoolArray, FloatArray, RegressionProblem
+from .robot_channels import SLIP_FRACTION, STILL_SPEED, RobotProblemBuilder
+from .robot_motion import choose_cutoff
+from .robot_rollout import robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, twists
+from .rollout import Windows
 from .subject import Opened
 
-ROLLOUT_WINDOW = 0.5  # [s]
-ROLLOUT_STEP = 1e-3  # [s]
-SIGNALS = ("v_x", "v_y", "omega")
+CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
 
 
 class RobotSubject:
@@ -38,6 +36,7 @@ class RobotSubject:
         self.robot = robot
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
+        self._missing: tuple[str, ...] = ()
         self._sensors: tuple[Path, tuple[bool, bool]] | None = None
 
     @classmethod
@@ -48,14 +47,45 @@ class RobotSubject:
     def open(self, path: Path, role: str, topics: Mapping[str, str]) -> Opened:
         """Read one rosbag2 folder or file."""
         recording = Recording.open(path, self.robot, topics)
+        found = recording.warnings
+        missing = _missing_casters(self.robot, recording)
+        self._check_casters(path, missing)
+        if missing:
+            recording = Recording.open(path, self._seen_robot(), topics)
+            # The force of one caster unknown, that of all together is.
+            joints = recording.joint_states
+            recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
         self._check_sensors(path, recording)
-        warnings = tuple(f"{warning.topic}: {warning.text}" for warning in recording.warnings)
-        return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, warnings))
+        warnings = [f"{warning.topic}: {warning.text}" for warning in found]
+        apart = _contradiction(self._seen_robot(), recording)
+        if apart > SLIP_FRACTION:
+            warnings.append(
+                f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
+                "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
+            )
+        return Opened(recording, InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings)))
+
+    def _seen_robot(self) -> RobotDescription:
+        """The robot as far as its recordings hold it."""
+        if not self._missing:
+            return self.robot
+        casters = tuple(caster for caster in self.robot.casters if caster.name not in self._missing)
+        physics = tuple(i for i in self.robot.physics if not set(i.target) & set(self._missing))
+        return dataclasses.replace(self.robot, casters=casters, physics=physics)
+
+    def _check_casters(self, path: Path, missing: tuple[str, ...]) -> None:
+        """All recordings of one analysis lack the same casters, if any."""
+        if self._sensors is None:
+            self._missing = missing
+        elif missing != self._missing:
+            raise MismatchError(
+                f"{path} lacks {', '.join(missing) or 'no caster'}, and {self._sensors[0]} lacks "
+                f"{', '.join(self._missing) or 'none'}; allowed: recordings with the same casters in one analysis"
+            )
 
     def _check_sensors(self, path: Path, recording: Recording) -> None:
         """All recordings of one analysis have the same channels, those held out too."""
-        effort = recording.joint_states.effort
-        present = (effort is not None and bool(np.isfinite(effort).any()), recording.imu is not None)
+        present = _has_effort(recording), _has_imu(recording)
         if self._sensors is None:
             self._sensors = path, present
         first, expected = self._sensors
@@ -68,10 +98,14 @@ class RobotSubject:
 
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem."""
-        recordings = [o.recording for o in opened]
+        recordings, robot = [o.recording for o in opened], self._seen_robot()
         if self._cutoff is None:
-            self._cutoff = choose_cutoff(self.robot, recordings)
-        return RobotProblemBuilder(self.robot, recordings, self._cutoff).build()
+            self._cutoff = choose_cutoff(robot, recordings)
+        try:
+            return RobotProblemBuilder(robot, recordings, self._cutoff).build()
+        except MismatchError as error:
+            told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
+            raise MismatchError("; ".join((str(error), *told))) from None
 
     def unit(self, unit: str) -> str:
         """Return a unit as it is."""
@@ -82,8 +116,9 @@ class RobotSubject:
         return get(instance.name).statement(instance.target, instance.parameters)
 
     def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> RobotSubject:
-        """Return the robot with effects added; numbers within their tolerance stay as the file has them."""
-        subject = RobotSubject(dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects)))
+        """Return the robot with effects added and its numbers re-tuned; those of its readings have no place in it."""
+        robot = retuned_robot(self.robot, retuned)
+        subject = RobotSubject(dataclasses.replace(robot, physics=(*robot.physics, *effects)))
         subject._cutoff = self._cutoff
         return subject
 
@@ -91,38 +126,132 @@ class RobotSubject:
         """Return the description as it stands in a file."""
         return robot_to_mapping(self.robot)
 
-    def rollout(self, opened: Sequence[Opened]) -> dict[str, float]:
-        """Drive the reduced plant with the measured torques over windows, started at the measured motion.
+    def path(self, opened: Opened) -> tuple[FloatArray, FloatArray] | None:
+        """Return stamps (S,) and pose (S, 3) by `ground_truth/odom`, else by `odom`; None without both."""
+        recording: Recording = opened.recording
+        for series in (recording.ground_truth, recording.odom):
+            if series is not None and len(series.stamp) > 1:
+                return series.stamp, series.pose
+        return None
 
-        The twist of the simulated robot at the end of each window is held against the recorded one, relative to how much the
-        twist changes over a window.
-        """
+    def absent(self, opened: Sequence[Opened]) -> tuple[tuple[str, str], ...]:
+        """Return what was not recorded, and what that costs, in words."""
         recordings = [o.recording for o in opened]
-        if self._cutoff is None:
-            self._cutoff = choose_cutoff(self.robot, recordings)
-        numbers = ModelNumbers.of(as_it_really_is(self.robot))
-        if np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3):
-            return {}
-        plant = ReducedPlant(self.robot, ROLLOUT_STEP)
-        apart, change = [], []
-        for index, recording in enumerate(recordings):
-            if recording.joint_states.effort is None:
-                return {}
-            for seen in read_motions(self.robot, recording, index, self._cutoff, with_torque=True):
-                motion = without_reading_errors(self.robot, seen)
-                angle = np.ascontiguousarray(motion.position[:, :, STEER])
-                twist, _ = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, motion.velocity)
-                length = max(2, round(ROLLOUT_WINDOW * motion.rate))
-                steps = max(1, round(1.0 / (motion.rate * ROLLOUT_STEP)))
-                for start in range(0, len(motion.time) - length, length):
-                    plant.reset(steer_angle=angle[start])
-                    plant.set_motion(twist[start], motion.position[start], motion.velocity[start])
-                    for row in range(start, start + length):
-                        plant.step(motion.torque[row], steps)
-                    apart.append(plant.state().twist - twist[start + length])
-                    change.append(twist[start + length] - twist[start])
-        if not apart:
-            return {}
-        error = np.sqrt(np.mean(np.square(apart), axis=0))
-        size = np.sqrt(np.mean(np.square(change), axis=0))
-        return {name: float(error[k] / max(size[k], 1e-12)) for k, name in enumerate(SIGNALS)}
+        cannot = "forces, friction and masses cannot be judged, nor simulated"
+        casters = tuple((f"caster {name}", f"{cannot}, and its wheel is not seen") for name in self._missing)
+        return casters + tuple(
+            (sensor, cost)
+            for sensor, there, cost in (
+                ("effort in joint_states", _has_effort, cannot),
+                ("imu/data", _has_imu, "slip of all wheels together, and faults of the sensor itself, cannot be seen"),
+                ("ground_truth/odom", _has_truth, "the path is the robot's own; what all wheels do wrong alike is not seen"),
+            )
+            if not all(map(there, recordings))
+        )
+
+    def windows(self, opened: Sequence[Opened]) -> Windows | None:
+        """Return the windows to simulate; None without torques, or for a robot that cannot be driven by them."""
+        recordings = [o.recording for o in opened]
+        without_offset = bool(np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3))
+        if without_offset or not all(map(_has_effort, recordings)):
+            return None
+        return robot_windows(self.robot, recordings)
+
+    def rollout(self, windows: Windows) -> FloatArray:
+        """Return the squared errors of the reduced plant under the measured torques, (W, H, S)."""
+        return rollout_squares(self.robot, windows)
+
+    def rollout_floor(self, windows: Windows, rng: np.random.Generator) -> FloatArray:
+        """Return the squared errors that the noise of the sensors makes in it, (W, H, S)."""
+        return rollout_floor(self.robot, windows, rng)
+
+
+def _missing_casters(robot: RobotDescription, recording: Recording) -> tuple[str, ...]:
+    """Casters of which one joint's angle was never measured, if others' were."""
+    joint_seen: BoolArray = np.asarray(np.isfinite(recording.joint_states.position).any(axis=0))
+    missing = tuple(name for name, joints in zip(robot.caster_names, joint_seen, strict=True) if not joints.all())
+    return missing if len(missing) < robot.n else ()
+
+
+def _contradiction(robot: RobotDescription, recording: Recording) -> float:
+    """Median of the largest slip that wheels show against each other over the fastest one's speed, where they move."""
+    joints = recording.joint_states
+    whole = np.isfinite(joints.position).all(axis=(1, 2)) & np.isfinite(joints.velocity).all(axis=(1, 2))
+    moving = np.flatnonzero(whole & (np.abs(joints.velocity[:, :, DRIVE]).max(axis=1) > STILL_SPEED))
+    rows = moving[:: max(1, len(moving) // CHECKED_ROWS)]
+    if len(rows) < CHECKED_ROWS // 10:
+        return 0.0
+    numbers = ModelNumbers.of(as_it_really_is(robot))
+    angle, rate = np.ascontiguousarray(joints.position[rows, :, STEER]), np.ascontiguousarray(joints.velocity[rows])
+    _, slip = twists(numbers.steer_axis, numbers.caster_offset, numbers.radius, angle, rate)
+    along, across = numbers.radius * rate[:, :, DRIVE], numbers.caster_offset[:, 0] * rate[:, :, STEER]
+    return float(np.median(slip / np.hypot(along, across).max(axis=1)))
+
+
+def _has_effort(recording: Recording) -> bool:
+    return bool(np.isfinite(recording.joint_states.effort).any())
+
+
+def _has_imu(recording: Recording) -> bool:
+    return recording.imu is not None
+
+
+def _has_truth(recording: Recording) -> bool:
+    return recording.ground_truth is not None
+
+
+def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotDescription:
+    """Return the robot with numbers of its description re-tuned.
+
+    Args:
+        robot: the robot.
+        retuned: by the names that the findings give them; those that are no number of the description change nothing.
+    """
+    chassis = robot.chassis
+    x, y, z = chassis.com
+    com = (x + retuned.get("chassis.com.x", 0.0), y + retuned.get("chassis.com.y", 0.0), z)
+    chassis = dataclasses.replace(
+        chassis,
+        mass=retuned.get("chassis.mass", chassis.mass),
+        com=com,
+        inertia_zz=retuned.get("chassis.inertia_zz", chassis.inertia_zz),
+    )
+    first = robot.casters[0]
+    # Numbers of a kind are re-tuned together: what is stated of the first caster, in proportion for all.
+    stated = {
+        "module.mass": first.module.mass,
+        "module.inertia_zz": first.module.inertia_zz,
+        "wheel.inertia_axle": first.wheel.inertia_axle,
+        "rotors.drive": float(robot.armature[0, DRIVE, DRIVE]),
+        "rotors.steer": float(robot.armature[0, STEER, STEER]),
+    }
+    scale = {name: retuned.get(name, value) / value if value > 0.0 else 1.0 for name, value in stated.items()}
+
+    def caster(old: Caster) -> Caster:
+        x, y = old.caster_offset
+        return dataclasses.replace(
+            old,
+            caster_offset=(x + retuned.get(f"caster_offset.x/{old.name}", 0.0), y),
+            wheel_radius=retuned.get(f"wheel_radius/{old.name}", old.wheel_radius),
+            module=dataclasses.replace(
+                old.module,
+                mass=old.module.mass * scale["module.mass"],
+                inertia_zz=old.module.inertia_zz * scale["module.inertia_zz"],
+            ),
+            wheel=dataclasses.replace(old.wheel, inertia_axle=old.wheel.inertia_axle * scale["wheel.inertia_axle"]),
+            rotors=dataclasses.replace(
+                old.rotors,
+                drive=old.rotors.drive * scale["rotors.drive"],
+                steer=old.rotors.steer * scale["rotors.steer"],
+            ),
+        )
+
+    contact, softness = robot.contact, retuned.get("contact.stiffness", 1.0)
+    contact = dataclasses.replace(
+        contact,
+        lambda_p=contact.lambda_p * softness,
+        lateral=dataclasses.replace(contact.lateral, lambda_p=contact.lateral.lambda_p * softness),
+    )
+    return dataclasses.replace(
+        robot, chassis=chassis, casters=tuple(caster(old) for old in robot.casters), contact=contact
+    )

@@ -8,10 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from pcw_description.effect_instance import EffectInstance
 
 from .findings import InputFinding
-from .regression_problem import RegressionProblem
+from .regression_problem import FloatArray, RegressionProblem
+from .rollout import Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +52,20 @@ class Subject(Protocol):
     def mapping(self) -> dict[str, Any]:
         """Return the description as it stands in a file."""
 
-    def rollout(self, opened: Sequence[Opened]) -> dict[str, float]:
-        """Return the error of forward simulation over short windows, per signal, relative to the signal's spread."""
+    def path(self, opened: Opened) -> tuple[FloatArray, FloatArray] | None:
+        """Return stamps (S,) and pose (S, 3) of a robot by a tracker or by its odometry; None where there is none."""
+
+    def absent(self, opened: Sequence[Opened]) -> tuple[tuple[str, str], ...]:
+        """Return what was not recorded, and what that costs, in words."""
+
+    def windows(self, opened: Sequence[Opened]) -> Windows | None:
+        """Return windows of the recordings to drive models of this subject over; None where that cannot be done."""
+
+    def rollout(self, windows: Windows) -> FloatArray:
+        """Return the squared errors of forward simulation at the horizons of every window, (W, H, S)."""
+
+    def rollout_floor(self, windows: Windows, rng: np.random.Generator) -> FloatArray:
+        """Return the squared errors that noise of start and input makes in a model that is right, (W, H, S)."""
 
 
 def file_digest(path: Path) -> str:

@@ -1,0 +1,155 @@
+"""What a fit says of data that it has not seen: other recordings, or manoeuvres left out of the fit in turn.
+
+Everything is answered from Gram matrices of the whitened problem, so that leaving out an effect or a manoeuvre costs no
+more than a small system of equations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from .evidence_selection import Selection
+from .manoeuvres import manoeuvres
+from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .whitened_regression import Instance, WhitenedRegression
+
+FOLDS = 4  # parts that manoeuvres are dealt out to in turn
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """Folds: what each is fitted on and what it is judged on.
+
+    Attributes:
+        problem: that is judged.
+        instances: the effects, as the fitted problem has them.
+        columns: of nuisances and effects in `problem` (T, C, k); an effect that it does not show has zeros.
+        fold: which fold judges each sample (T,).
+        train, test: Gram matrices of [columns, residual], whitened, per fold (F, k + 1, k + 1).
+        deviations: prior deviations (k,); nuisances: how many of the k are numbers of the description.
+        source: what was held out, in words.
+    """
+
+    problem: RegressionProblem
+    instances: tuple[Instance, ...]
+    columns: FloatArray
+    fold: IntArray
+    train: FloatArray
+    test: FloatArray
+    deviations: FloatArray
+    nuisances: int
+    source: str
+
+    @classmethod
+    def recordings(
+        cls, problem: RegressionProblem, instances: Sequence[Instance], selection: Selection, other: RegressionProblem
+    ) -> HeldOut:
+        """Hold out other recordings: fitted on all of `problem`, judged on `other`."""
+        regression = selection.regression
+        columns = _columns_elsewhere(problem, instances, other)
+        flat = np.concatenate([columns, other.residual[:, :, None]], axis=2)
+        everything = np.zeros(len(other.time), dtype=np.int64)
+        judged = WhitenedRegression(other, regression.noise, np.ones_like(other.residual), everything)
+        white = judged.whiten_columns(flat)
+        count = len(np.unique(other.recording))
+        return cls(
+            other,
+            tuple(instances),
+            columns,
+            everything,
+            regression.grams(instances).sum(axis=0)[None],
+            (white.T @ white)[None],
+            regression.deviations(instances),
+            len(problem.nuisances),
+            f"{count} held-out recording{'s' if count > 1 else ''}",
+        )
+
+    @classmethod
+    def manoeuvres(cls, problem: RegressionProblem, instances: Sequence[Instance], selection: Selection) -> HeldOut:
+        """Hold out manoeuvres of the fitted recordings in turn, each judged by a fit to the others."""
+        number = manoeuvres(problem)
+        regression = WhitenedRegression(problem, selection.regression.noise, np.ones_like(problem.residual), number)
+        grams = regression.grams(instances)
+        labels = np.array(regression.block_labels()) % FOLDS
+        test = np.stack([grams[labels == fold].sum(axis=0) for fold in range(FOLDS)])
+        count = int(number.max()) + 1
+        return cls(
+            problem,
+            tuple(instances),
+            _columns_elsewhere(problem, instances, problem),
+            number % FOLDS,
+            test.sum(axis=0) - test,
+            test,
+            regression.deviations(instances),
+            len(problem.nuisances),
+            f"{count} manoeuvres of the fitted recordings, each predicted from others",
+        )
+
+    def _kept(self, without: int | None) -> IntArray:
+        """Positions of the columns without those of one effect."""
+        positions = np.arange(len(self.deviations))
+        return positions if without is None else np.setdiff1d(positions, np.arange(*self.span(without)))
+
+    def span(self, index: int) -> tuple[int, int]:
+        """First and one past the last column of an effect."""
+        start = self.nuisances + sum(len(instance.active) for instance in self.instances[:index])
+        return start, start + len(self.instances[index].active)
+
+    def means(self, without: int | None = None) -> FloatArray:
+        """Fitted numbers of every fold (F, k), zeros for an effect that is left out."""
+        kept = self._kept(without)
+        found = np.zeros((len(self.train), len(self.deviations)))
+        for mean, gram in zip(found, self.train, strict=True):
+            precision = gram[np.ix_(kept, kept)] + np.diag(1.0 / self.deviations[kept] ** 2)
+            mean[kept] = np.linalg.solve(precision, gram[kept, -1])
+        return found
+
+    def predicted(self, means: FloatArray) -> FloatArray:
+        """What nuisances and effects add to the nominal prediction (T, C), each sample by its own fold."""
+        total = np.zeros_like(self.problem.residual)
+        for fold, mean in enumerate(means):
+            rows = self.fold == fold
+            total[rows] = self.columns[rows] @ mean
+        return total
+
+    def help_of(self, index: int) -> tuple[float, float]:
+        """What an effect takes from the error of held-out data, and how much it does there at all [nats].
+
+        Half the whitened squared error; what the description's numbers would have to move without it counts as well.
+        """
+        both, alone = self.means(), self.means(index)
+        error = 0.5 * (self._error(alone) - self._error(both)) + self._retuning(alone) - self._retuning(both)
+        rows = slice(*self.span(index))
+        work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
+        return error, 0.5 * float(work)
+
+    def _error(self, means: FloatArray) -> float:
+        extended = np.concatenate([-means, np.ones((len(means), 1))], axis=1)
+        return float(np.einsum("fi,fij,fj->", extended, self.test, extended))
+
+    def _retuning(self, means: FloatArray) -> float:
+        """Half the squared distance of the description's numbers from nominal, in tolerances."""
+        moved = means[:, : self.nuisances] / self.deviations[: self.nuisances]
+        return 0.5 * float(np.mean(np.sum(moved**2, axis=1)))
+
+
+def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance], other: RegressionProblem) -> FloatArray:
+    """Columns (T, C, k) in another problem of the nuisances and effects of a problem, matched by name."""
+    nuisances = {nuisance.name: nuisance.column for nuisance in other.nuisances}
+    places = {term.key: index for index, term in enumerate(other.terms)}
+    nothing = np.zeros(other.residual.shape)
+    parts = [nuisances.get(nuisance.name, nothing)[:, :, None] for nuisance in problem.nuisances]
+    for instance in instances:
+        term = problem.terms[instance.term]
+        names = [term.parameters[k].name for k in instance.active]
+        if term.key not in places:
+            parts.append(np.zeros((*nothing.shape, len(names))))
+            continue
+        place = places[term.key]
+        shown = {parameter.name: k for k, parameter in enumerate(other.terms[place].parameters)}
+        columns = other.columns(place, instance.shape)
+        parts.append(np.stack([columns[..., shown[n]] if n in shown else nothing for n in names], axis=2))
+    return np.concatenate(parts, axis=2) if parts else np.zeros((*nothing.shape, 0))

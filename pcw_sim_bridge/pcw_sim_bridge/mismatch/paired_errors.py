@@ -1,0 +1,94 @@
+"""Errors before and after on the same data, with intervals from a bootstrap over blocks of time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from .regression_problem import FloatArray, IntArray
+
+Pair = tuple[float, float]
+
+DRAWS = 400
+BLOCK = 4.0  # [s]; longer than any memory of a residual, and than the longest horizon of a simulation
+
+
+@dataclasses.dataclass(frozen=True)
+class PairedErrors:
+    """Mean squared errors of K quantities, each over the square of its own size.
+
+    Attributes:
+        before, after: (K,); NaN where there is nothing to judge.
+        before_draws, after_draws: of the bootstrap (D, K), block by block the same data in both.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    before_draws: FloatArray
+    after_draws: FloatArray
+
+    @classmethod
+    def of(cls, before: FloatArray, after: FloatArray, block: IntArray, rng: np.random.Generator) -> PairedErrors:
+        """Average squared relative errors (N, K), NaN where not to be judged; `block` (N,) says what is drawn together."""
+        _, place = np.unique(block, return_inverse=True)
+        blocks = int(place.max()) + 1 if len(place) else 1
+        usable = np.isfinite(before) & np.isfinite(after)
+        sums = [np.zeros((blocks, before.shape[1])) for _ in range(3)]
+        for total, values in zip(sums, (before, after, np.ones_like(before)), strict=True):
+            np.add.at(total, place, np.where(usable, values, 0.0))
+        draws = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=DRAWS).astype(float)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            first, second = (total.sum(axis=0) / sums[2].sum(axis=0) for total in sums[:2])
+            counts = draws @ sums[2]
+            return cls(first, second, draws @ sums[0] / counts, draws @ sums[1] / counts)
+
+    def take(self, positions: IntArray) -> PairedErrors:
+        """Return some of the quantities."""
+        return PairedErrors(*(getattr(self, field.name)[..., positions] for field in dataclasses.fields(self)))
+
+    @property
+    def judged(self) -> IntArray:
+        """Positions of the quantities with anything to judge."""
+        return np.flatnonzero(np.isfinite(self.before))
+
+    def pooled(self) -> PairedErrors:
+        """Return the mean over all quantities that can be judged, as one (1,)."""
+        own = self.take(self.judged)
+        if not len(own.before):
+            nothing = np.full((DRAWS, 1), np.nan)
+            return PairedErrors(np.full(1, np.nan), np.full(1, np.nan), nothing, nothing)
+        parts = [getattr(own, field.name) for field in dataclasses.fields(own)]
+        # A draw may leave out all blocks in which one quantity could be judged.
+        return PairedErrors(*(np.nanmean(part, axis=-1, keepdims=True) for part in parts))
+
+    def worse(self) -> FloatArray:
+        """By what part the root mean square error has grown (K,), zero where that may be chance (95 %) or it has not."""
+        found = np.zeros(len(self.before))
+        for k in self.judged:
+            change = self.after_draws[:, k] - self.before_draws[:, k]
+            if np.quantile(change[np.isfinite(change)], 0.025) > 0.0 and self.after[k] > self.before[k]:
+                found[k] = np.sqrt(self.after[k] / max(self.before[k], 1e-300)) - 1.0
+        return found
+
+
+def interval(draws: FloatArray) -> Pair:
+    """Return the 95 % interval of draws (D,)."""
+    finite = draws[np.isfinite(draws)]
+    if not len(finite):
+        return float("nan"), float("nan")
+    low, high = np.quantile(finite, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def gap_closed(before: FloatArray, after: FloatArray, floor: float) -> FloatArray:
+    """(before - after) / (before - floor) of root mean square errors, kept within 0 and 1; 0 where there is no gap."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        closed = (before - after) / (before - floor)
+    return np.where(before > floor, np.clip(closed, 0.0, 1.0), 0.0)
+
+
+def blocks_of(recording: IntArray, time: FloatArray) -> IntArray:
+    """Number the blocks of `BLOCK` seconds of recordings, (N,)."""
+    within = np.floor(time / BLOCK).astype(np.int64)
+    return recording.astype(np.int64) * (int(within.max(initial=0)) + 2) + within

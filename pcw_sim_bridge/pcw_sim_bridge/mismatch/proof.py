@@ -1,0 +1,354 @@
+"""Proves a patch on data that its fit has not seen: inverse residual and forward simulation, before and after.
+
+Every error has a 95 % interval from a bootstrap over blocks of time, and a floor: what would be left of a model that is
+right, from the noise of the sensors. An effect that takes nothing from the held-out error, though it is at work there, is
+not proposed; nor is one with which the simulation follows less well than without.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.registry import get
+
+from .errors import MismatchError
+from .explanation import Explanation
+from .findings import ChannelProof, FitFinding, LadderFinding, RolloutProof
+from .held_out import HeldOut
+from .paired_errors import PairedErrors, blocks_of, gap_closed, interval
+from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .rollout import HORIZONS, MAIN_HORIZON, RAN_AWAY, Windows
+from .subject import Opened, Subject
+from .whitened_regression import Instance
+
+# An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
+AT_WORK = 5.0
+# Of its channel's floor; an event that moves a channel by less is over.
+EVENT_SHARE = 0.1
+
+Retune = Callable[[Explanation], Mapping[str, float]]
+Reduce = Callable[[Explanation, Sequence[Instance]], Explanation]
+
+
+@dataclasses.dataclass(frozen=True)
+class Proof:
+    """What the held-out data say.
+
+    Attributes:
+        explanation: with the effects that stay.
+        finding: errors before and after.
+        held_out: what was judged; predicted: what the fits add to the nominal prediction of it (T, C).
+        dropped: ladder lines of the effects that do not help.
+        notes: what a reader has to know of the proof.
+    """
+
+    explanation: Explanation
+    finding: FitFinding
+    held_out: HeldOut
+    predicted: FloatArray
+    dropped: tuple[LadderFinding, ...]
+    notes: tuple[str, ...]
+
+
+def effect_instance(effect_name: str, target: Sequence[str], values: Mapping[str, float]) -> EffectInstance:
+    """Return an effect with all its parameters, as it stands under `physics:`; defaults for those not given."""
+    effect = get(effect_name)
+    complete = {p.name: float(p.default or 0.0) for p in effect.parameters} | dict(values)
+    # Rounding of an estimate at its bound must not make a file that its own reader refuses.
+    bounded = {p.name: min(max(complete[p.name], p.lower), p.upper) for p in effect.parameters}
+    return EffectInstance(effect_name, tuple(target), bounded)
+
+
+def is_event(effect_name: str) -> bool:
+    """Whether an effect comes once, from outside, and says nothing of another time."""
+    return "start" in {parameter.name for parameter in get(effect_name).parameters}
+
+
+class Prover:
+    """Judges explanations of one problem on held-out data."""
+
+    def __init__(
+        self,
+        subject: Subject,
+        opened: Sequence[Opened],
+        held_out: Sequence[Opened],
+        retune: Retune,
+        reduce: Reduce,
+        rng: np.random.Generator,
+    ) -> None:
+        """Open the held-out data.
+
+        Args:
+            subject: the nominal description.
+            opened: what was fitted.
+            held_out: other recordings, or nothing: then manoeuvres of the fitted ones are held out.
+            retune: explanation -> numbers of the description that go into the patch.
+            reduce: explanation, effects that stay -> the explanation by these alone.
+            rng: of bootstrap and noise.
+        """
+        self.subject, self.retune, self.reduce, self.rng = subject, retune, reduce, rng
+        self.other = subject.problem(held_out) if held_out else None
+        self.windows = subject.windows(held_out or opened)
+        if self.windows is not None and not len(self.windows.begin):
+            self.windows = None
+        self.before = None if self.windows is None else subject.rollout(self.windows)
+
+    def prove(self, explanation: Explanation) -> Proof:
+        """Drop what does not help, and hold the rest against the data.
+
+        Raises:
+            MismatchError: the held-out recordings fill other channels than the fitted ones.
+        """
+        dropped: list[LadderFinding] = []
+        notes: list[str] = []
+        while True:
+            held_out = self._held_out(explanation)
+            after = None
+            useless = self._useless(held_out)
+            if useless is None:
+                after = self._rollout(explanation, held_out)
+                useless = self._misleading(explanation, held_out, after)
+            if useless is None:
+                break
+            index, reason = useless
+            label, nats = explanation.search.label(held_out.instances[index]), held_out.help_of(index)[0]
+            dropped.append(LadderFinding(f"drop {label}", nats, nats, f"fitted but did not help held out: {reason}"))
+            notes.append(f"{label} was fitted but did not help held out: {reason}. It is not proposed.")
+            kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
+            explanation = self.reduce(explanation, kept)
+        notes += self._remarks(explanation, held_out, after)
+        nothing = not explanation.named
+        predicted = np.zeros_like(held_out.problem.residual) if nothing else held_out.predicted(held_out.means())
+        finding = self._finding(explanation, held_out, predicted, after)
+        return Proof(explanation, finding, held_out, predicted, tuple(dropped), tuple(notes))
+
+    # -- what is judged ---------------------------------------------------------------------------------------------
+
+    def _held_out(self, explanation: Explanation) -> HeldOut:
+        """The folds for the effects of an explanation that last; the time of the others is taken out of the data."""
+        problem, selection = explanation.search.problem, explanation.selection
+        lasting = [i for i in selection.fit.instances if not is_event(problem.terms[i.term].effect)]
+        if self.other is not None:
+            names = [[c.name for c in p.channels] for p in (problem, self.other)]
+            if names[0] != names[1]:
+                differ = ", ".join(sorted(set(names[0]) ^ set(names[1])))
+                raise MismatchError(
+                    f"channels {differ} are only in the fitted or only in the held-out recordings; allowed: recordings with "
+                    "the same sensors in one analysis"
+                )
+            return HeldOut.recordings(problem, lasting, selection, self.other)
+        busy = _busy(explanation)
+        quiet = dataclasses.replace(problem, valid=problem.valid & ~busy[:, None]) if busy.any() else problem
+        return HeldOut.manoeuvres(quiet, lasting, selection)
+
+    def _quiet_windows(self, explanation: Explanation) -> Windows | None:
+        """The windows, with nothing to judge in them while an event was at work."""
+        windows, problem = self.windows, explanation.search.problem
+        if windows is None or self.other is not None:
+            return windows
+        busy = _busy(explanation)
+        for recording in np.unique(problem.recording[busy]):
+            times = problem.time[busy & (problem.recording == recording)]
+            windows = windows.without(int(recording), (float(times.min()), float(times.max())))
+        return windows
+
+    # -- what stays -------------------------------------------------------------------------------------------------
+
+    def _useless(self, held_out: HeldOut) -> tuple[int, str] | None:
+        """The effect that adds most to the held-out error, if one adds to it."""
+        helps = [held_out.help_of(index) for index in range(len(held_out.instances))]
+        found = [(nats, index) for index, (nats, work) in enumerate(helps) if work > AT_WORK and nats <= 0.0]
+        return (min(found)[1], "the error is no smaller with it") if found else None
+
+    def _misleading(
+        self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None
+    ) -> tuple[int, str] | None:
+        """Where the simulation follows less well with the patch: the effect without which it follows best."""
+        windows = self._quiet_windows(explanation)
+        if windows is None or self.before is None or after is None or not held_out.instances:
+            return None
+
+        def errors(squares: FloatArray) -> PairedErrors:
+            assert self.before is not None
+            return _rollout_errors(windows, self.before, squares, self.rng, [MAIN_HORIZON]).pooled()
+
+        if errors(after).worse()[0] == 0.0:
+            return None
+        without = [self._rollout(explanation, held_out, index) for index in range(len(held_out.instances))]
+        follows = [float(errors(squares).after[0]) for squares in without if squares is not None]
+        return int(np.argmin(follows)), "the simulation follows less well with it"
+
+    def _rollout(self, explanation: Explanation, held_out: HeldOut, without: int | None = None) -> FloatArray | None:
+        """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""
+        if self.windows is None or self.before is None:
+            return None
+        if not held_out.instances:
+            return self.before
+        fold = _fold_of(held_out, self.windows)
+        after = np.full_like(self.before, np.nan)
+        retuned = self.retune(explanation)
+        for number, mean in enumerate(held_out.means(without)):
+            own = fold == number
+            if own.any():
+                model = self._patched(explanation.search.problem, held_out, mean, retuned, without)
+                after[own] = model.rollout(self.windows.take(own))
+        return after
+
+    def _patched(
+        self,
+        problem: RegressionProblem,
+        held_out: HeldOut,
+        mean: FloatArray,
+        retuned: Mapping[str, float],
+        without: int | None,
+    ) -> Subject:
+        """The description with the effects and numbers that one fold found."""
+        effects = []
+        for index, instance in enumerate(held_out.instances):
+            if index == without:
+                continue
+            term, values = problem.terms[instance.term], mean[slice(*held_out.span(index))]
+            names = [term.parameters[k].name for k in instance.active]
+            found = dict(instance.shape) | dict(zip(names, map(float, values), strict=True))
+            effects.append(effect_instance(term.effect, term.target, found))
+        numbers = {
+            nuisance.name: nuisance.nominal + float(change)
+            for nuisance, change in zip(problem.nuisances, mean, strict=False)
+            if nuisance.name in retuned
+        }
+        return self.subject.patched(effects, numbers)
+
+    # -- what is said -----------------------------------------------------------------------------------------------
+
+    def _remarks(self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None) -> list[str]:
+        remarks = []
+        for index, instance in enumerate(held_out.instances):
+            if held_out.help_of(index)[1] <= AT_WORK:
+                label = explanation.search.label(instance)
+                remarks.append(f"{label} was not at work in what was held out: nothing there speaks for it or against it.")
+        for name in dict.fromkeys(n.term.effect for n in explanation.named if is_event(n.term.effect)):
+            remarks.append(f"{name} comes once, from outside: the time in which it acts is left out of the proof.")
+        if self.windows is not None and after is not None:
+            limited = self.windows.relative(after)[:, MAIN_HORIZON]
+            away = int(np.sum(np.any(limited >= RAN_AWAY**2, axis=1)))
+            if away:
+                remarks.append(f"Driven by the measured torques the simulation ran away in {away} of {len(limited)} windows.")
+        return remarks
+
+    def _finding(
+        self, explanation: Explanation, held_out: HeldOut, predicted: FloatArray, after: FloatArray | None
+    ) -> FitFinding:
+        problem = held_out.problem
+        spread = _spread(problem)
+        blank = np.where(problem.valid, 1.0, np.nan)
+        before, left = ((values * blank / spread) ** 2 for values in (problem.residual, problem.residual - predicted))
+        inverse = PairedErrors.of(before, left, blocks_of(problem.recording, problem.time), self.rng)
+        floors = explanation.floor / spread
+        judged = inverse.judged
+        pooled, floor = inverse.pooled(), float(np.sqrt(np.mean(floors[judged] ** 2))) if len(judged) else 0.0
+        worse = {problem.channels[k].name: float(inverse.worse()[k]) for k in judged}
+        for recording in np.unique(problem.recording):
+            rows = problem.recording == recording
+            block = blocks_of(problem.recording[rows], problem.time[rows])
+            own = PairedErrors.of(before[rows], left[rows], block, self.rng).pooled()
+            worse[f"recording {recording + 1}"] = float(own.worse()[0])
+        rollouts, rollout_gap = self._rollout_findings(explanation, held_out, after, worse)
+        at = max(worse, key=lambda name: worse[name], default=None)
+        harm = worse[at] if at is not None else 0.0
+        main = [entry for entry in rollouts if entry.horizon == HORIZONS[MAIN_HORIZON]]
+        closed = gap_closed(np.sqrt(pooled.before), np.sqrt(pooled.after), floor)
+        draws = gap_closed(np.sqrt(pooled.before_draws), np.sqrt(pooled.after_draws), floor)
+        return FitFinding(
+            source=held_out.source,
+            inverse_nrmse=(float(np.sqrt(pooled.before[0])), float(np.sqrt(pooled.after[0]))),
+            rollout={entry.signal: (entry.before, entry.after) for entry in main},
+            gap_closed=float(closed[0]),
+            gap_closed_ci95=interval(draws[:, 0]),
+            inverse_ci95=(interval(np.sqrt(pooled.before_draws[:, 0])), interval(np.sqrt(pooled.after_draws[:, 0]))),
+            inverse_floor=floor,
+            channels=tuple(
+                ChannelProof(problem.channels[k].name, float(floors[k]), *_both(inverse, k)) for k in judged
+            ),
+            rollouts=rollouts,
+            rollout_gap_closed=rollout_gap,
+            harm=harm,
+            harm_at=at if harm > 0.0 else None,
+        )
+
+    def _rollout_findings(
+        self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None, worse: dict[str, float]
+    ) -> tuple[tuple[RolloutProof, ...], float | None]:
+        """Errors by signal and horizon, and the part of the gap that is closed at the main horizon; adds to `worse`."""
+        windows = self._quiet_windows(explanation)
+        if windows is None or self.before is None or after is None:
+            return (), None
+        retuned = self.retune(explanation)
+        model = self._patched(explanation.search.problem, held_out, held_out.means().mean(axis=0), retuned, None)
+        noise = windows.relative((model if held_out.instances else self.subject).rollout_floor(windows, self.rng))
+        counts = np.maximum(np.isfinite(noise).sum(axis=0), 1)
+        floors = np.nansum(noise, axis=0) / counts
+        found, gap = [], None
+        for h, horizon in enumerate(HORIZONS):
+            errors = _rollout_errors(windows, self.before, after, self.rng, [h])
+            grown = errors.worse()
+            for k in errors.judged:
+                signal = windows.signals[k]
+                found.append(RolloutProof(signal, horizon, float(np.sqrt(floors[h, k])), *_both(errors, k)))
+                worse[f"{signal} after {horizon:g} s"] = float(grown[k])
+            if h == MAIN_HORIZON and len(errors.judged):
+                pooled, floor = errors.pooled(), float(np.sqrt(np.mean(floors[h, errors.judged])))
+                gap = float(gap_closed(np.sqrt(pooled.before), np.sqrt(pooled.after), floor)[0])
+        return tuple(found), gap
+
+
+def _busy(explanation: Explanation) -> np.ndarray:
+    """Samples (T,) of the fitted problem at which an event is at work."""
+    busy = np.zeros(len(explanation.search.problem.time), dtype=bool)
+    for named in explanation.named:
+        if is_event(named.term.effect):
+            busy |= np.any(np.abs(named.contribution) > EVENT_SHARE * explanation.floor, axis=1)
+    return busy
+
+
+def _spread(problem: RegressionProblem) -> FloatArray:
+    """Standard deviation of the measured side of every channel (C,)."""
+    spread = np.ones(len(problem.channels))
+    for c in range(len(spread)):
+        values = problem.measured[problem.valid[:, c], c]
+        if len(values):
+            spread[c] = max(float(np.std(values)), 1e-300)
+    return spread
+
+
+def _both(errors: PairedErrors, k: int) -> tuple[float, float, tuple[float, float], tuple[float, float]]:
+    """Root mean square before and after of quantity k, and their intervals."""
+    return (
+        float(np.sqrt(errors.before[k])),
+        float(np.sqrt(errors.after[k])),
+        interval(np.sqrt(errors.before_draws[:, k])),
+        interval(np.sqrt(errors.after_draws[:, k])),
+    )
+
+
+def _rollout_errors(
+    windows: Windows, before: FloatArray, after: FloatArray, rng: np.random.Generator, horizons: Sequence[int]
+) -> PairedErrors:
+    """Errors of all signals at some horizons, side by side."""
+    sides = [windows.relative(squares)[:, horizons].reshape(len(windows.begin), -1) for squares in (before, after)]
+    return PairedErrors.of(sides[0], sides[1], blocks_of(windows.recording, windows.begin), rng)
+
+
+def _fold_of(held_out: HeldOut, windows: Windows) -> IntArray:
+    """Fold of every window (W,): that of the sample with which it begins."""
+    fold = np.zeros(len(windows.begin), dtype=np.int64)
+    problem = held_out.problem
+    for recording in np.unique(windows.recording):
+        own, rows = windows.recording == recording, np.flatnonzero(problem.recording == recording)
+        if len(rows):
+            at = np.searchsorted(problem.time[rows], windows.begin[own]).clip(0, len(rows) - 1)
+            fold[own] = held_out.fold[rows[at]]
+    return fold

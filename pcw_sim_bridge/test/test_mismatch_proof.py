@@ -1,0 +1,303 @@
+"""The proof: windows of simulation, held-out manoeuvres, intervals, harm, and effects that do not help."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pcw_description import load_robot
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.registry import get
+from pcw_sim_bridge.mismatch.__main__ import main
+from pcw_sim_bridge.mismatch.locations import place_of_power, supported
+from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
+from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
+from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
+from pcw_sim_bridge.plants.reduced import ReducedPlant, WindowStarts
+from pcw_sim_bridge.simulated_run import record_run
+
+THESIS = load_robot("thesis")
+SLED = """\
+format: pcw_axis/1
+name: sled
+kind: linear
+provenance: {all: made up for this test}
+columns:
+  time: {column: time, unit: s}
+  position: {column: position, unit: m}
+  force: {column: force, unit: N}
+inertia: 20.0
+tolerances: {inertia: 1 %}
+physics: []
+"""
+
+
+def physics(name: str, target: str, **values: float) -> EffectInstance:
+    """Return an effect with its defaults."""
+    return EffectInstance(name, (target,), get(name).check(values, "physics"))
+
+
+def sled(folder: Path, name: str, coulomb: float, seed: int, duration: float = 20.0) -> Path:
+    """Write a CSV of a 20 kg sled on a path of sines, with friction and noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, duration, 0.002)
+    position = 0.2 * np.sin(1.7 * time) + 0.05 * np.sin(5.3 * time)
+    velocity = 0.34 * np.cos(1.7 * time) + 0.265 * np.cos(5.3 * time)
+    acceleration = -0.578 * np.sin(1.7 * time) - 1.4045 * np.sin(5.3 * time)
+    force = 20.0 * acceleration + coulomb * np.tanh(velocity / 1e-3) + 0.3 * rng.standard_normal(len(time))
+    table = np.column_stack([time, position + 1e-6 * rng.standard_normal(len(time)), force])
+    np.savetxt(folder / name, table, delimiter=",", header="time,position,force", comments="")
+    return folder / name
+
+
+def analyse(folder: Path, fit: Path, *holdout: Path) -> dict[str, object]:
+    """Return report.json of the sled."""
+    (folder / "sled.yaml").write_text(SLED)
+    options = ["--holdout", *map(str, holdout)] if holdout else []
+    out = folder / "report"
+    assert main(["analyze", str(fit), "--robot", str(folder / "sled.yaml"), "--out", str(out), "--quiet", *options]) == 0
+    report: dict[str, object] = json.loads((out / "report.json").read_text())
+    return report
+
+
+# -- windows ----------------------------------------------------------------------------------------------------------
+
+
+def test_windows_rolled_out_together_are_those_stepped_one_by_one() -> None:
+    """Nothing of a window, its actuators' memories included, is left in the next one."""
+    lag = physics("actuator_lag", THESIS.caster_names[0], **{get("actuator_lag").parameters[0].name: 0.02})
+    robot = dataclasses.replace(THESIS, physics=(lag, physics("drive_coulomb_friction", "rear_left", coulomb=0.5)))
+    rng = np.random.default_rng(0)
+    windows, rows, steps, marks = 3, 40, 4, [10, 40]
+    torque = rng.uniform(-3.0, 3.0, (windows, rows, robot.n, 2))
+    position, velocity = rng.uniform(-1.0, 1.0, (2, windows, robot.n, 2))
+    twist, pose, time = rng.uniform(-0.3, 0.3, (windows, 3)), rng.uniform(-1.0, 1.0, (windows, 3)), np.array([0.0, 3.0, 7.0])
+
+    def twice(values: np.ndarray) -> np.ndarray:
+        return np.stack([values, values], axis=1)
+
+    plant = ReducedPlant(robot)
+    starts = WindowStarts(time, twice(pose), twice(twist), twice(position), twice(velocity))
+    bodies, joints = plant.roll_out(torque, steps, starts, 0, marks)
+    for w in range(windows):
+        plant.reset(pose=pose[w])
+        plant.set_motion(twist[w], position[w], velocity[w])
+        for row in range(rows):
+            plant.step(torque[w, row], steps)
+            if row + 1 in marks:
+                state, k = plant.state(), marks.index(row + 1)
+                np.testing.assert_allclose(bodies[w, k], [*state.pose, *state.twist], rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose(joints[w, k, :, 0], state.joint_position, rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose(joints[w, k, :, 1], state.joint_velocity, rtol=1e-9, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, EffectInstance]:
+    """A drive of a robot with friction on one caster."""
+
+    def twist(time: float) -> np.ndarray:
+        return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
+
+    friction = physics("drive_coulomb_friction", "rear_left", coulomb=0.8)
+    path = tmp_path_factory.mktemp("recorded") / "run"
+    record_run(dataclasses.replace(THESIS, physics=(friction,)), twist, 14.0, 1, path, controlled_as=THESIS)
+    return path, friction
+
+
+def test_the_right_robot_rolls_out_to_the_noise_and_the_nominal_one_does_not(
+    recorded: tuple[Path, EffectInstance],
+) -> None:
+    """The floor is an estimate of what noise leaves: the true model comes near it, at every horizon."""
+    path, friction = recorded
+    nominal = RobotSubject(THESIS)
+    opened = [nominal.open(path, "fit", {})]
+    windows = nominal.windows(opened)
+    assert windows is not None
+    assert np.isfinite(windows.change[:, 1]).all()
+    true_robot = nominal.patched([friction], {})
+    error, right, floor = (
+        np.sqrt(np.nanmean(windows.relative(squares), axis=0))
+        for squares in (
+            nominal.rollout(windows), true_robot.rollout(windows), true_robot.rollout_floor(windows, np.random.default_rng(0)),
+        )
+    )  # fmt: skip
+    print("nominal", error, "true", right, "floor", floor, sep="\n")
+    assert (right[1] < 0.1 * error[1]).all()
+    assert (right[1] < 4.0 * floor[1]).all()
+    assert (floor[1] < 4.0 * right[1]).all()
+
+
+def test_some_windows_give_what_all_of_them_give(recorded: tuple[Path, EffectInstance]) -> None:
+    """Taking windows out changes nothing for the others; a time that is left out is not judged."""
+    subject = RobotSubject(THESIS)
+    windows = subject.windows([subject.open(recorded[0], "fit", {})])
+    assert windows is not None
+    some = np.arange(len(windows.begin)) % 3 == 1
+    np.testing.assert_allclose(subject.rollout(windows.take(some)), subject.rollout(windows)[some])
+    quiet = windows.without(0, (5.0, 6.0))
+    touched = (windows.begin < 6.0) & (windows.begin + 0.5 > 5.0)
+    assert touched.any()
+    assert np.isnan(quiet.change[touched, 1]).all()
+    np.testing.assert_array_equal(quiet.change[~touched, 1], windows.change[~touched, 1])
+
+
+def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
+    """Each where the description holds it; what it does not hold changes nothing."""
+    caster = THESIS.casters[1]
+    robot = retuned_robot(
+        THESIS,
+        {
+            "chassis.mass": 75.0,
+            "chassis.com.y": 0.01,
+            f"wheel_radius/{caster.name}": 0.0751,
+            f"caster_offset.x/{caster.name}": -1e-3,
+            "module.mass": 1.1 * THESIS.casters[0].module.mass,
+            "contact.stiffness": 1.2,
+            "torque_lag": 1e-3,
+        },
+    )
+    assert robot.chassis.mass == 75.0
+    assert robot.chassis.com[1] == pytest.approx(THESIS.chassis.com[1] + 0.01)
+    assert robot.casters[1].wheel_radius == 0.0751
+    assert robot.casters[1].caster_offset[0] == pytest.approx(caster.caster_offset[0] - 1e-3)
+    assert robot.casters[3].module.mass == pytest.approx(1.1 * THESIS.casters[3].module.mass)
+    assert robot.contact.lambda_p == pytest.approx(1.2 * THESIS.contact.lambda_p)
+    assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
+
+
+# -- manoeuvres, intervals, places ------------------------------------------------------------------------------------
+
+
+def problem_of(variables: dict[str, np.ndarray], rate: float) -> RegressionProblem:
+    """A problem of one channel with nothing in it but variables."""
+    count = len(next(iter(variables.values())))
+    zero, once = np.zeros((count, 1)), np.zeros(count, dtype=np.int64)
+    return RegressionProblem(
+        (Channel("gyro", "rad/s"),), np.arange(count) / rate, once, once, rate, zero, zero, zero == 0.0, (), (), variables
+    )
+
+
+def test_manoeuvres_change_where_the_motion_does() -> None:
+    """Six seconds along x, six along y, twelve of turning: cut where the character changes, and long ones in two."""
+    rate = 20.0
+    time = np.arange(0.0, 24.0, 1.0 / rate)
+    wave = np.sin(3.0 * time)
+    speeds = {"v_x": time < 6.0, "v_y": (time >= 6.0) & (time < 12.0), "omega": time >= 12.0}
+    number = manoeuvres(problem_of({name: wave * there for name, there in speeds.items()}, rate))
+    borders = time[np.flatnonzero(np.diff(number)) + 1]
+    for change in (6.0, 12.0):
+        assert np.abs(borders - change).min() < 1.0
+    assert (np.diff(number) >= 0).all()
+    assert np.bincount(number).max() <= LONGEST * rate + 1
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
+    """Squared errors of known mean, independent from block to block."""
+    hits = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        squares = np.repeat(rng.chisquare(4, size=(40, 1)) / 4.0, 10, axis=0)
+        errors = PairedErrors.of(squares, 0.5 * squares, np.repeat(np.arange(40), 10), rng)
+        low, high = interval(errors.before_draws[:, 0])
+        hits += low < 1.0 < high
+    print(f"{hits} of 200")
+    assert 178 <= hits <= 198  # 95 % less what a bootstrap of 40 blocks is known to lack
+
+
+def test_worse_is_what_is_no_chance() -> None:
+    """The same noise before and after is nothing; a tenth more everywhere is, though smaller than that noise."""
+    rng = np.random.default_rng(0)
+    before = rng.chisquare(3, size=(400, 2))
+    after = before * np.array([1.21, 1.0])
+    after[:, 1] = rng.permutation(before[:, 1])
+    after[::7, 0] = np.nan
+    errors = PairedErrors.of(before, after, np.arange(400) // 10, rng)
+    assert errors.worse()[0] == pytest.approx(0.1, abs=1e-6)
+    assert errors.worse()[1] == 0.0
+    nothing = PairedErrors.of(np.full((4, 1), np.nan), np.full((4, 1), np.nan), np.arange(4), rng)
+    assert not len(nothing.judged)
+    assert np.isnan(nothing.pooled().before).all()
+    np.testing.assert_allclose(gap_closed(np.array([1.0, 1.0, 0.1]), np.array([0.1, 2.0, 0.1]), 0.1), [1.0, 0.0, 0.0])
+
+
+def test_an_effect_that_begins_in_the_middle_is_supported_from_there() -> None:
+    """What every sample says for it: against it before, for it afterwards, with noise larger than both."""
+    rng = np.random.default_rng(1)
+    gain = np.r_[np.full(300, -0.4), np.full(500, 0.5)] + rng.standard_normal(800)
+    start, stop = supported(gain)
+    assert abs(start - 300) <= 12
+    assert stop == 800
+    assert supported(np.abs(gain)) == (0, 800)
+    assert supported(np.zeros(10)) == (0, 10)
+
+
+def test_a_leftover_at_one_place_is_placed_and_one_everywhere_is_not() -> None:
+    """A figure of eight with something at a corner of it, passed three times."""
+    rng = np.random.default_rng(2)
+    phase = np.linspace(0.0, 6.0 * np.pi, 3000)
+    path = np.stack([2.0 * np.sin(phase), np.sin(2.0 * phase)], axis=1)
+    there = np.linalg.norm(path - np.array([1.9, 0.5]), axis=1) < 0.35
+    assert 0 < there.mean() < 0.2
+    power = rng.chisquare(1, 3000) * (0.02 + 5.0 * there)
+    place = place_of_power(path, power, np.ones(3000, dtype=bool))
+    assert place is not None
+    centre = path[there].mean(axis=0)
+    assert np.hypot(place.x - centre[0], place.y - centre[1]) < 0.15
+    assert 0.1 < place.radius < 0.6
+    assert place_of_power(path, rng.chisquare(1, 3000), np.ones(3000, dtype=bool)) is None
+
+
+# -- what is proposed -------------------------------------------------------------------------------------------------
+
+
+def test_what_helps_held_out_is_proved_channel_by_channel(tmp_path: Path) -> None:
+    """Friction in both recordings: the gap closes, inverse and forward, with intervals and without harm."""
+    report = analyse(tmp_path, sled(tmp_path, "fit.csv", 4.0, 1), sled(tmp_path, "other.csv", 4.0, 2))
+    assert [effect["name"] for effect in report["effects"]] == ["drive_coulomb_friction"]
+    proof = report["fit"]["holdout"]
+    before, after = proof["inverse_nrmse"]
+    for value, (low, high) in zip((before, after), proof["inverse_ci95"], strict=True):
+        assert low <= value <= high
+    assert proof["inverse_floor"] == pytest.approx(after, rel=0.3)
+    assert proof["gap_closed"] > 0.95
+    assert proof["gap_closed_ci95"][0] > 0.9
+    assert proof["rollout_gap_closed"] > 0.9
+    assert (proof["harm"], proof["harm_at"]) == (0.0, None)
+    assert {(entry["signal"], entry["horizon_s"]) for entry in proof["horizons"]} == {
+        (signal, horizon) for signal in ("position", "velocity") for horizon in (0.1, 0.5, 2.0)
+    }
+    assert [entry["name"] for entry in proof["per_channel"]] == ["axis_force"]
+
+
+def test_without_other_recordings_manoeuvres_are_held_out(tmp_path: Path) -> None:
+    """And the same is found."""
+    report = analyse(tmp_path, sled(tmp_path, "fit.csv", 4.0, 1))
+    assert [effect["name"] for effect in report["effects"]] == ["drive_coulomb_friction"]
+    proof = report["fit"]["holdout"]
+    assert "manoeuvres" in proof["source"]
+    assert proof["gap_closed"] > 0.95
+
+
+def test_what_does_not_help_held_out_is_not_proposed(tmp_path: Path) -> None:
+    """The friction of the fitted recording is not in the other one: no effect, no patch, no harm, and the report says why."""
+    report = analyse(tmp_path, sled(tmp_path, "fit.csv", 4.0, 1), sled(tmp_path, "other.csv", 0.0, 2))
+    assert report["effects"] == []
+    assert any("drive_coulomb_friction" in note and "did not help held out" in note for note in report["notes"])
+    assert any("did not help held out" in step["outcome"] for step in report["ladder"])
+    proof = report["fit"]["holdout"]
+    assert proof["inverse_nrmse"][0] == proof["inverse_nrmse"][1]
+    assert proof["harm"] == 0.0
+    assert "drive_coulomb_friction" not in (tmp_path / "report" / "robot_patched.yaml").read_text()
+
+
+def test_nothing_missing_is_an_empty_patch_without_harm(tmp_path: Path) -> None:
+    """Before and after are the same."""
+    report = analyse(tmp_path, sled(tmp_path, "fit.csv", 0.0, 3), sled(tmp_path, "other.csv", 0.0, 4))
+    assert report["verdict"] == "no_mismatch"
+    proof = report["fit"]["holdout"]
+    for before, after in (proof["inverse_nrmse"], *proof["rollout"].values()):
+        assert before == after
+    assert proof["harm"] == 0.0
