@@ -20,6 +20,7 @@ from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.findings import (
     VERDICTS,
     ChannelFinding,
+    ChannelProof,
     EffectFinding,
     Findings,
     FitFinding,
@@ -27,7 +28,10 @@ from pcw_sim_bridge.mismatch.findings import (
     LadderFinding,
     LocationFinding,
     ParameterFinding,
+    Place,
+    ResidualMap,
     RetunedFinding,
+    RolloutProof,
     Trace,
     UnknownFinding,
 )
@@ -101,6 +105,7 @@ def demo_findings(samples: int = 4000) -> Findings:
                 "drive",
                 ((1.0, 6.5), (12.25, 19.75), *((20.0 + k, 20.5 + k) for k in range(9))),
                 {"drive_speed": (0.4, 12.7), "steer_angle": (-3.1, 3.1)},
+                Place(1.25, -0.5, 0.3),
             ),
             LocationFinding(("accelerometer/x",), (), "chassis", (), {}),
         ),
@@ -138,7 +143,18 @@ def demo_findings(samples: int = 4000) -> Findings:
             RetunedFinding("rear_right.steer_zero", "rad", 0.0, -0.0011, -0.0014, -0.0008, 0.002),
         ),
         fit=FitFinding(
-            "runs/chirp.mcap", (0.673, 0.0596), {"pose/x": (0.412, 0.021), "pose/yaw": (0.013, 0.0151)}, 0.982
+            "runs/chirp.mcap",
+            (0.673, 0.0596),
+            {"pose/x": (0.412, 0.021), "pose/yaw": (0.013, 0.0151)},
+            0.982,
+            gap_closed_ci95=(0.97, 0.99),
+            inverse_ci95=((0.64, 0.71), (0.057, 0.063)),
+            inverse_floor=0.05,
+            channels=(ChannelProof("chassis_force/x", 0.04, 0.71, 0.0451, (0.66, 0.75), (0.042, 0.047)),),
+            rollouts=(RolloutProof("yaw", 2.0, 0.011, 0.013, 0.0151, (0.012, 0.014), (0.0148, 0.0153)),),
+            rollout_gap_closed=0.91,
+            harm=0.16,
+            harm_at="yaw after 2 s",
         ),
         ladder=tuple(
             [
@@ -159,6 +175,18 @@ def demo_findings(samples: int = 4000) -> Findings:
             "Without a tracked pose, a common error of all wheel radii cannot be told from the gyro's scale.",
         ),
         seconds=4.21,
+        residual_map=demo_map(samples),
+        absent=(("imu/data", "faults of the sensor itself cannot be seen"),),
+    )
+
+
+def demo_map(samples: int) -> ResidualMap:
+    """A robot on a figure of eight whose residual is large on one of the loops."""
+    clock = np.arange(samples) / 120.0
+    path = np.stack([2.0 * np.sin(0.4 * clock), np.sin(0.8 * clock)], axis=1)
+    loud = 1.0 + 20.0 * (path[:, 0] > 1.0)
+    return ResidualMap(
+        loud, np.ones(samples), clock, {"speed": np.abs(np.cos(clock)), "steer_angle/rear_left": np.sin(clock)}, path
     )
 
 
@@ -191,6 +219,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # -- report.json ------------------------------------------------------------------------------------------------------
 
 NUMBER, TEXT, FLAG = "number", "text", "flag"
+ERRORS = {
+    "floor": NUMBER, "before": NUMBER, "after": NUMBER, "before_ci95": (NUMBER, NUMBER), "after_ci95": (NUMBER, NUMBER),
+}  # fmt: skip
 CONTRACT = {
     "format": TEXT,
     "verdict": TEXT,
@@ -223,17 +254,25 @@ CONTRACT = {
     "unknown": [
         {"channel": TEXT, "depends_on": [TEXT], "expression": {"?": TEXT}, "share_explained": NUMBER}
     ],
-    # `source` (what was held out, in words) is an addition inside.
+    # Beside what the contract has, all that is said of it more closely.
     "fit": {
         "holdout": {
             "source": TEXT,
             "inverse_nrmse": (NUMBER, NUMBER),
+            "inverse_ci95": {"?": ((NUMBER, NUMBER), (NUMBER, NUMBER))},
+            "inverse_floor": {"?": NUMBER},
             "rollout": {"*": (NUMBER, NUMBER)},
             "gap_closed": NUMBER,
+            "gap_closed_ci95": {"?": (NUMBER, NUMBER)},
+            "rollout_gap_closed": {"?": NUMBER},
+            "harm": NUMBER,
+            "harm_at": {"?": TEXT},
+            "per_channel": [{"name": TEXT, **ERRORS}],
+            "horizons": [{"signal": TEXT, "horizon_s": NUMBER, **ERRORS}],
         }
     },
 }
-ADDITIONS = {"retuned", "ladder", "notes"}
+ADDITIONS = {"retuned", "ladder", "notes", "absent"}
 
 
 def check_structure(value: Any, wanted: Any, where: str = "report") -> None:

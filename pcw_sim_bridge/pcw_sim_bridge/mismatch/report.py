@@ -22,8 +22,10 @@ import numpy as np
 import yaml
 
 from .errors import MismatchError
-from .findings import VERDICTS, Findings, ParameterFinding, RetunedFinding
-from .report_figures import SUPERSCRIPTS, TraceFigures, draw_traces, pretty_unit, time_origin
+from .findings import VERDICTS, ChannelProof, Findings, ParameterFinding, RetunedFinding, RolloutProof
+from .report_drawing import SUPERSCRIPTS, Drawing, pretty_unit
+from .report_figures import TraceFigures, draw_traces, time_origin
+from .report_maps import draw_maps
 
 HTML, JSON, PATCHED, FIGURES = "report.html", "report.json", "robot_patched.yaml", "figures"
 TEMPLATE = "report.html.j2"
@@ -170,12 +172,12 @@ def write_report(findings: Findings, patched: Mapping[str, Any] | None, out: Pat
             if patched_text is not None:
                 _write(folder / PATCHED, patched_text)
             figures = draw_traces(findings)
+            maps = None if findings.residual_map is None else draw_maps(findings.residual_map)
             (folder / FIGURES).mkdir()
-            for traces in figures:
-                for drawing in (traces.over_time, traces.window, traces.against_variable):
-                    if drawing is not None:
-                        (folder / FIGURES / f"{drawing.name}.png").write_bytes(drawing.png)
-            _write(folder / HTML, report_html(findings, figures, patched))
+            for drawing in (maps, *(d for t in figures for d in (t.over_time, t.window, t.against_variable))):
+                if drawing is not None:
+                    (folder / FIGURES / f"{drawing.name}.png").write_bytes(drawing.png)
+            _write(folder / HTML, report_html(findings, figures, maps, patched))
     except OSError as error:
         raise MismatchError(f"--out {out}: cannot be written: {error.strerror or error}") from error
     return out / HTML
@@ -323,7 +325,12 @@ def seconds(value: float) -> str:
 # -- the page --------------------------------------------------------------------------------------------------------
 
 
-def report_html(findings: Findings, figures: list[TraceFigures], patched: Mapping[str, Any] | None = None) -> str:
+def report_html(
+    findings: Findings,
+    figures: list[TraceFigures],
+    maps: Drawing | None = None,
+    patched: Mapping[str, Any] | None = None,
+) -> str:
     """Return the text of report.html."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -347,6 +354,8 @@ def report_html(findings: Findings, figures: list[TraceFigures], patched: Mappin
         ],
         retuned=[_retuned_row(item) for item in findings.retuned],
         fit_rows=_fit_rows(findings),
+        proof_rows=_proof_rows(findings),
+        maps=maps,
         ladder=_ladder_rows(findings),
         short_list=SHORT_LIST,
         origin=time_origin(findings),
@@ -385,27 +394,55 @@ def _retuned_row(item: RetunedFinding) -> dict[str, Any]:
 
 
 def _fit_rows(findings: Findings) -> list[dict[str, Any]]:
-    """Rows of the held-out table; bars are relative to the larger of each pair."""
-    if findings.fit is None:
+    """Rows of the held-out table: the channels together, and every signal after half a second."""
+    fit = findings.fit
+    if fit is None:
         return []
-    pairs = [("inverse: measured side of the channels (NRMSE)", findings.fit.inverse_nrmse)]
-    pairs += [(f"rollout: {signal}", pair) for signal, pair in findings.fit.rollout.items()]
-    rows = []
-    for name, (before, after) in pairs:
-        largest = max(before, after) or 1.0
-        rows.append(
-            {
-                "name": name,
-                "before": before,
-                "after": after,
-                "before_bar": 100.0 * before / largest,
-                "after_bar": 100.0 * after / largest,
-                "change": change(before, after),
-                # Worse by more than rounding: one per cent is what counts as harm.
-                "worse": after > 1.01 * before,
-            }
-        )
-    return rows
+    row = _fit_row("inverse: measured side of the channels (NRMSE)", *fit.inverse_nrmse)
+    if fit.inverse_ci95 is not None and fit.inverse_floor is not None:
+        row |= {"before_interval": _interval(fit.inverse_ci95[0]), "after_interval": _interval(fit.inverse_ci95[1])}
+        row["floor"] = fit.inverse_floor
+    return [row, *(_fit_row(f"rollout: {signal}", *pair) for signal, pair in fit.rollout.items())]
+
+
+def _proof_rows(findings: Findings) -> list[dict[str, Any]]:
+    """Rows of the table of every channel, and of every signal at every horizon, with intervals and floors."""
+    fit = findings.fit
+    if fit is None:
+        return []
+    named: list[tuple[str, ChannelProof | RolloutProof]] = [(entry.name, entry) for entry in fit.channels]
+    named += [(f"{entry.signal} after {entry.horizon:g} s", entry) for entry in fit.rollouts]
+    return [
+        _fit_row(name, entry.before, entry.after)
+        | {
+            "floor": entry.floor,
+            "before_interval": _interval(entry.before_ci95),
+            "after_interval": _interval(entry.after_ci95),
+        }
+        for name, entry in named
+    ]
+
+
+def _fit_row(name: str, before: float, after: float) -> dict[str, Any]:
+    """One error before and after; bars are relative to the larger of the two."""
+    largest = max(before, after) or 1.0
+    return {
+        "name": name,
+        "before": before,
+        "after": after,
+        "before_interval": None,
+        "after_interval": None,
+        "floor": None,
+        "before_bar": 100.0 * before / largest,
+        "after_bar": 100.0 * after / largest,
+        "change": change(before, after),
+        # Worse by more than rounding: one per cent is what counts as harm.
+        "worse": after > 1.01 * before,
+    }
+
+
+def _interval(pair: tuple[float, float]) -> str:
+    return f"[{number(pair[0])}, {number(pair[1])}]"
 
 
 def _ladder_rows(findings: Findings) -> list[tuple[Any, float]]:

@@ -1,15 +1,13 @@
 """Figures of the report: measured, nominal and patched over time, and what is left over.
 
-Matplotlib is imported when the first figure is drawn, without pyplot: no display, no global state. A curve of any
-length is drawn as the envelope of its minima and maxima, so that a spike of one sample is seen and drawing stays fast.
+A curve of any length is drawn as the envelope of its minima and maxima, so that a spike of one sample is seen and drawing
+stays fast.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,31 +15,27 @@ import numpy as np
 
 from .findings import Findings, LocationFinding, Trace
 from .regression_problem import BoolArray, FloatArray
+from .report_drawing import (
+    AFTER,
+    BEFORE,
+    LABELS,
+    MEASURED,
+    SHADE,
+    Drawing,
+    dress,
+    finish,
+    legend,
+    new_figure,
+)
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; widths and order tell them apart in grey print.
-MEASURED, BEFORE, AFTER, SHADE = "#8b929c", "#d55e00", "#0072b2", "#f0c808"
-LABELS = {"measured": "measured", "before": "nominal model", "after": "patched model"}
-
+MOST_TRACES = 4  # each is three figures, and reading them takes longer than drawing them
 WINDOW = 5.0  # [s] of the close-up
 ENVELOPE_BINS = 700  # about one per pixel column
 SCATTER_POINTS = 1200
 CURVE_BINS = 24
 NEARLY_ALL = 0.9
 LONGEST_PAUSE = 0.05  # of the time shown; a longer pause between pieces is cut short
-RESOLUTION = 130  # dots per inch
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 EPOCH = 1e6  # [s]; stamps beyond are of a calendar, and shown from the first one
-
-
-@dataclasses.dataclass(frozen=True)
-class Drawing:
-    """One figure: the name of its file without suffix, its content, its size on paper [CSS pixels], what it shows."""
-
-    name: str
-    png: bytes
-    width: int
-    height: int
-    description: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,13 +83,32 @@ def time_origin(findings: Findings) -> float:
 
 
 def draw_traces(findings: Findings) -> list[TraceFigures]:
-    """Draw every trace of the findings."""
+    """Draw the traces of the channels in which nominal and patched model differ most."""
     origin = time_origin(findings)
     drawn = []
-    for number, trace in enumerate(findings.traces, start=1):
+    for number, trace in enumerate(telling(findings.traces), start=1):
         places = [p for p in findings.locations if trace.channel in p.channels] if trace.role == "fit" else []
         drawn.append(draw_trace(trace, f"{number:02d}_{file_stem(trace.channel)}_{file_stem(trace.role)}", origin, places))
     return drawn
+
+
+def telling(traces: Sequence[Trace]) -> list[Trace]:
+    """At most about `MOST_TRACES` traces, both roles of a channel together, first the channels that a patch helps most."""
+
+    def gain(trace: Trace) -> float:
+        before, after = (root_mean_square(trace.measured - side) for side in (trace.before, trace.after))
+        return before / after if after > 0.0 else 0.0
+
+    channels: dict[str, list[Trace]] = {}
+    for trace in traces:
+        channels.setdefault(trace.channel, []).append(trace)
+    best = sorted(channels.values(), key=lambda own: -np.nan_to_num(max(map(gain, own))))
+    chosen: list[Trace] = []
+    for own in best:
+        if chosen and len(chosen) + len(own) > MOST_TRACES:
+            break
+        chosen += own
+    return chosen
 
 
 def draw_trace(trace: Trace, stem: str, origin: float, places: Sequence[LocationFinding] = ()) -> TraceFigures:
@@ -229,62 +242,7 @@ def file_stem(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:60] or "channel"
 
 
-def pretty_unit(unit: str) -> str:
-    """Return a unit as it is printed: "N m s/rad" -> "N·m·s/rad", "m/s^2" -> "m/s²"; "1" is none."""
-    if unit.strip() in ("", "1", "-"):
-        return ""
-    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(SUPERSCRIPTS), unit.strip())
-    return re.sub(r"(?<=\S)[ *]+(?=\S)", "·", raised)
-
-
 # -- drawing ------------------------------------------------------------------------------------------------------
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=RESOLUTION, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _finish(figure: Any, name: str, description: str) -> Drawing:
-    from PIL import Image  # what matplotlib itself writes PNG with; here without alpha, and quickly
-
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # a name in a script that the font lacks
-        figure.canvas.draw()
-    buffer = io.BytesIO()
-    pixels = np.ascontiguousarray(np.asarray(figure.canvas.buffer_rgba())[:, :, :3])
-    Image.fromarray(pixels).save(buffer, "png", compress_level=2, dpi=(RESOLUTION, RESOLUTION))
-    width, height = figure.get_size_inches()
-    return Drawing(name, buffer.getvalue(), round(96 * width), round(96 * height), description)
-
-
-def _dress(axes: Any, ylabel: str, unit: str, xlabel: str | None = None) -> None:
-    """Grid, frame and labels. Names come from files: nothing in them is TeX."""
-    axes.grid(True, color="#e4e7eb", linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color("#9aa1ab")
-    axes.locator_params(nbins=7 if axes.get_position().width < 0.7 else 9, axis="x")
-    axes.locator_params(nbins=6, axis="y")
-    axes.tick_params(colors="#3b424c", labelsize=8.5, length=3)
-    axes.set_ylabel(f"{ylabel} [{pretty_unit(unit) or '1'}]", fontsize=9, color="#20252c", parse_math=False)
-    if xlabel is not None:
-        axes.set_xlabel(xlabel, fontsize=9, color="#20252c", parse_math=False)
-
-
-def _legend(axes: Any) -> None:
-    legend = axes.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8.5, frameon=False, handlelength=1.6,
-        columnspacing=1.4, borderaxespad=0.1,
-    )
-    for handle in legend.get_lines():
-        handle.set_linewidth(2.5)
 
 
 def _curves(axes: Any, line: Timeline, curves: Mapping[str, FloatArray]) -> None:
@@ -305,7 +263,7 @@ def _over_time(
     description: str,
 ) -> Drawing:
     """Measured and both predictions above, both residuals below, over the whole time."""
-    figure = _figure(10.0, 4.9)
+    figure = new_figure(10.0, 4.9)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     figure.subplots_adjust(left=0.085, right=0.985, top=0.93, bottom=0.105, hspace=0.1)
     _curves(above, line, curves)
@@ -322,15 +280,15 @@ def _over_time(
         if window is not None:
             axes.axvspan(*window, facecolor="none", edgecolor="#5b6470", linewidth=0.9, linestyle="--")
     clock = "time, pauses cut [s]" if line.cut else "time [s]"
-    _dress(above, trace.channel, trace.unit)
-    _dress(below, "residual", trace.unit, clock)
+    dress(above, trace.channel, trace.unit)
+    dress(below, "residual", trace.unit, clock)
     below.axhline(0.0, color="#5b6470", linewidth=0.6)
     if len(line.shown) > 1:
         margin = 0.01 * (line.shown[-1] - line.shown[0])
         below.set_xlim(line.shown[0] - margin, line.shown[-1] + margin)
-    _legend(above)
+    legend(above)
     figure.align_ylabels()
-    return _finish(figure, name, description)
+    return finish(figure, name, description)
 
 
 def _steps(line: Timeline, within: BoolArray, low: float, high: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -348,7 +306,7 @@ def _close_up(
     trace: Trace, name: str, line: Timeline, curves: Mapping[str, FloatArray], window: tuple[float, float], description: str
 ) -> Drawing:
     """Measured and both predictions in `window`."""
-    figure = _figure(5.6, 3.7)
+    figure = new_figure(5.6, 3.7)
     axes = figure.subplots()
     figure.subplots_adjust(left=0.145, right=0.975, top=0.91, bottom=0.135)
     first, last = np.searchsorted(line.shown, window)
@@ -357,14 +315,14 @@ def _close_up(
     )
     _curves(axes, part, {key: values[first:last] for key, values in curves.items()})
     axes.set_xlim(*window)
-    _dress(axes, trace.channel, trace.unit, "time, pauses cut [s]" if line.cut else "time [s]")
-    _legend(axes)
-    return _finish(figure, name, description)
+    dress(axes, trace.channel, trace.unit, "time, pauses cut [s]" if line.cut else "time [s]")
+    legend(axes)
+    return finish(figure, name, description)
 
 
 def _against_variable(trace: Trace, name: str, residuals: Mapping[str, FloatArray], description: str) -> Drawing:
     """Both residuals against the trace's variable."""
-    figure = _figure(5.6, 3.7)
+    figure = new_figure(5.6, 3.7)
     axes = figure.subplots()
     figure.subplots_adjust(left=0.145, right=0.975, top=0.91, bottom=0.135)
     variable = np.asarray(trace.variable, dtype=float)
@@ -389,6 +347,6 @@ def _against_variable(trace: Trace, name: str, residuals: Mapping[str, FloatArra
     if span > 0.0:
         axes.set_ylim(min(limits) - 0.08 * span, max(limits) + 0.08 * span)
     axes.axhline(0.0, color="#5b6470", linewidth=0.6)
-    _dress(axes, f"residual of {trace.channel}", trace.unit, trace.variable_name)
-    _legend(axes)
-    return _finish(figure, name, description)
+    dress(axes, f"residual of {trace.channel}", trace.unit, trace.variable_name)
+    legend(axes)
+    return finish(figure, name, description)
