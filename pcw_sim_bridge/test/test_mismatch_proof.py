@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,14 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_sim_bridge.mismatch.__main__ import main
-from pcw_sim_bridge.mismatch.locations import place_of_power, supported
+from pcw_sim_bridge.mismatch.explanation import NamedTerm
+from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
+from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
-from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem
+from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.plants.reduced import ReducedPlant, WindowStarts
 from pcw_sim_bridge.simulated_run import record_run
 
@@ -248,6 +252,30 @@ def test_a_leftover_at_one_place_is_placed_and_one_everywhere_is_not() -> None:
     assert np.hypot(place.x - centre[0], place.y - centre[1]) < 0.15
     assert 0.1 < place.radius < 0.6
     assert place_of_power(path, rng.chisquare(1, 3000), np.ones(3000, dtype=bool)) is None
+
+
+def located(effect: str, target: str, contribution: np.ndarray, **shape: float) -> LocationFinding:
+    """Where an effect of known shape is found that adds `contribution` (T,) to one channel of unit noise, 20 Hz."""
+    problem = problem_of({"speed": np.linspace(0.0, 1.0, len(contribution))}, 20.0)
+    term = Term(effect, (target,), (), ({},), lambda _: np.zeros((len(contribution), 1, 0)), ("speed",))
+    named = NamedTerm(Instance(0, tuple(shape.items()), ()), term, {}, 1.0, (), 20.0, 10.0, contribution[:, None])
+    explanation = SimpleNamespace(search=SimpleNamespace(problem=problem), floor=np.ones(1))
+    return locate(explanation, named)  # type: ignore[arg-type]
+
+
+def test_a_push_is_located_by_its_own_start_and_a_patch_by_its_place() -> None:
+    """The one in time, the other on the floor, and at the times and speeds at which it was there."""
+    contribution = np.zeros(600)
+    contribution[240:300] = 5.0
+    pushed = located("external_push", "chassis", contribution, start=12.03, duration=2.97)
+    assert pushed.intervals == ((12.03, 15.0),)
+    assert (pushed.place, pushed.casters, pushed.channels) == (None, (), ("gyro",))
+    slipped = located("low_friction_patch", "rear_left", contribution, x=1.5, y=-0.4, length=0.8, width=0.4)
+    assert slipped.place == Place(1.5, -0.4, 0.4)
+    [(start, stop)] = slipped.intervals
+    assert (start, stop) == pytest.approx((12.0, 15.0), abs=0.1)
+    low, high = slipped.region["speed"]
+    assert (low, high) == pytest.approx((0.4, 0.5), abs=0.01)
 
 
 # -- what is proposed -------------------------------------------------------------------------------------------------

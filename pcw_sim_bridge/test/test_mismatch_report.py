@@ -36,7 +36,15 @@ from pcw_sim_bridge.mismatch.findings import (
     UnknownFinding,
 )
 from pcw_sim_bridge.mismatch.report import check_output, write_report
-from pcw_sim_bridge.mismatch.report_figures import binned, envelope, timeline, worst_window
+from pcw_sim_bridge.mismatch.report_figures import (
+    MOST_TRACES,
+    binned,
+    envelope,
+    telling,
+    timeline,
+    worst_window,
+)
+from pcw_sim_bridge.mismatch.report_maps import binned_rms, draw_maps
 
 PATCHED = {
     "format": "pcw_robot/1",
@@ -382,7 +390,7 @@ def test_page_refers_to_nothing_outside_itself(demo: Path) -> None:
 def test_every_figure_of_the_page_is_a_file_too(demo: Path) -> None:
     page = (demo / "report.html").read_text(encoding="utf-8")
     files = sorted((demo / "figures").iterdir())
-    assert len(files) == 3 * len(demo_findings().traces)
+    assert len(files) == 1 + 3 * len(demo_findings().traces)
     assert all(file.read_bytes().startswith(b"\x89PNG") for file in files)
     assert page.count("<img") == len(files)
 
@@ -436,7 +444,7 @@ def test_page_shows_numbers_with_the_digits_they_have(demo: Path) -> None:
     assert page.count('<span class="tag part">beyond 3 tolerances</span>') == 1, (
         "only the radius moved by more than 3"
     )
-    assert page.count('<span class="tag bad">worse</span>') == 1, "only the rollout of the yaw got worse"
+    assert page.count('<span class="tag bad">worse</span>') == 2, "only the yaw got worse, in both tables"
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -586,6 +594,33 @@ def test_bin_means_follow_the_dependence() -> None:
     rows = binned(speed, np.sign(speed) + 0.1 * rng.standard_normal(20000))
     np.testing.assert_allclose(rows[:, 1], np.sign(rows[:, 0]), atol=0.02)
     np.testing.assert_allclose(rows[:, 3] - rows[:, 2], 2.0 * 1.2816 * 0.1, rtol=0.12)
+
+
+def test_of_many_channels_those_are_drawn_that_the_patch_changes_most() -> None:
+    """Both roles of a channel together, so that fitted and held out can be compared."""
+    quiet = [make_trace(f"quiet/{k}", "N", role) for k in range(9) for role in ("fit", "holdout")]
+    quiet = [dataclasses.replace(trace, after=trace.before) for trace in quiet]
+    loud = [make_trace("loud", "N", role) for role in ("fit", "holdout")]
+    chosen = telling([*quiet, *loud])
+    assert [(trace.channel, trace.role) for trace in chosen[:2]] == [("loud", "fit"), ("loud", "holdout")]
+    assert len(chosen) <= MOST_TRACES
+
+
+def test_bins_of_a_map_hold_the_power_that_is_there() -> None:
+    """A residual that grows with the variable; a sample that could not be judged counts nowhere."""
+    values = np.linspace(0.0, 2.0, 4000)
+    side = 1.0 + values
+    side[1000] = np.nan
+    centre, level = binned_rms(values, side)
+    np.testing.assert_allclose(level, 1.0 + centre, rtol=1e-3)
+
+
+def test_map_of_nothing_that_could_be_judged_is_drawn() -> None:
+    """All of it at a standstill; and a bench has no floor."""
+    nothing = np.full(50, np.nan)
+    path = np.zeros((50, 2))
+    drawn = [draw_maps(ResidualMap(nothing, nothing, np.arange(50.0), {}, on_floor)) for on_floor in (path, None)]
+    assert drawn[0].height > drawn[1].height
 
 
 def test_six_long_traces_take_less_than_three_seconds(tmp_path: Path) -> None:
@@ -792,7 +827,7 @@ def test_browser_shows_the_page_without_console_message_or_request(demo: Path, t
     page = demo / "report.html"
     dom, log, requests = open_in_chromium(page, tmp_path)
     assert "Coulomb friction of 0.412 N m in the drive of rear_left." in dom
-    assert dom.count("<img") == 9
+    assert dom.count("<img") == 10
     assert [line for line in log.splitlines() if "CONSOLE" in line] == []
     assert [request["url"] for request in requests] == []
 

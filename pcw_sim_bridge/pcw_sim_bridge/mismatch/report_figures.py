@@ -28,7 +28,7 @@ from .report_drawing import (
     new_figure,
 )
 
-MOST_TRACES = 4  # each is three figures, and reading them takes longer than drawing them
+MOST_TRACES = 3  # each is three figures, and reading them takes longer than drawing them
 WINDOW = 5.0  # [s] of the close-up
 ENVELOPE_BINS = 700  # about one per pixel column
 SCATTER_POINTS = 1200

@@ -23,8 +23,8 @@ def draw_maps(residuals: ResidualMap) -> Drawing:
     on_floor = residuals.path is not None and bool(np.isfinite(residuals.path).all(axis=1).any())
     figure = new_figure(10.0, 6.4 if on_floor else 3.0)
     grid = figure.add_gridspec(
-        2 if on_floor else 1, 6, left=0.07, right=0.98, top=0.95 if on_floor else 0.9, bottom=0.08 if on_floor else 0.16,
-        hspace=0.32, wspace=1.3, height_ratios=(1.0, 1.4) if on_floor else None,
+        2 if on_floor else 1, 6, left=0.07, right=0.915 if on_floor else 0.98, top=0.95 if on_floor else 0.9,
+        bottom=0.08 if on_floor else 0.16, hspace=0.32, wspace=1.3, height_ratios=(1.0, 1.4) if on_floor else None,
     )  # fmt: skip
     width = 6 // len(against)
     first = None
@@ -92,6 +92,6 @@ def _floor(figure: Any, grid: Any, path: FloatArray, residuals: ResidualMap) -> 
         axes.set_aspect("equal", adjustable="datalim")
         dress(axes, "y", "m", "x [m]")
         axes.set_title(LABELS[label], fontsize=9, loc="left", color="#20252c")
-    bar = figure.colorbar(dots, ax=panels, fraction=0.025, pad=0.02)
+    bar = figure.colorbar(dots, cax=figure.add_axes((0.93, 0.1, 0.013, 0.42)))
     bar.set_label("residual over noise [1]", fontsize=9, color="#20252c")
     bar.ax.tick_params(labelsize=8.5)
