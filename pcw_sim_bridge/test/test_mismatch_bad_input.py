@@ -234,10 +234,10 @@ def test_a_recording_of_a_robot_with_the_same_names_is_doubted(
 ) -> None:
     """Names alone do not tell: wheels that contradict each other by the geometry of the description do."""
 
-    def leading(caster: Caster) -> Caster:
-        return dataclasses.replace(caster, caster_offset=(-caster.caster_offset[0], caster.caster_offset[1]))
+    def larger(caster: Caster) -> Caster:
+        return dataclasses.replace(caster, wheel_radius=2.0 * caster.wheel_radius)
 
-    other = dataclasses.replace(THESIS, name="other", casters=tuple(map(leading, THESIS.casters)))
+    other = dataclasses.replace(THESIS, name="other", casters=(*map(larger, THESIS.casters[:2]), *THESIS.casters[2:]))
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(robot_to_mapping(other)))
     code = main(
         ["analyze", str(recorded), "--robot", str(tmp_path / "other.yaml"), "--out", str(tmp_path / "report"), "--quiet"]

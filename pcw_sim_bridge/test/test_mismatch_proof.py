@@ -321,6 +321,17 @@ def test_what_does_not_help_held_out_is_not_proposed(tmp_path: Path) -> None:
     assert "drive_coulomb_friction" not in (tmp_path / "report" / "robot_patched.yaml").read_text()
 
 
+def test_a_standstill_proves_nothing_and_manoeuvres_are_held_out_instead(tmp_path: Path) -> None:
+    """What was given to hold out never moves."""
+    table = np.loadtxt(sled(tmp_path, "still.csv", 4.0, 2), delimiter=",", skiprows=1)
+    table[:, 1] = 0.1 + 1e-6 * np.random.default_rng(0).standard_normal(len(table))
+    np.savetxt(tmp_path / "still.csv", table, delimiter=",", header="time,position,force", comments="")
+    report = analyse(tmp_path, sled(tmp_path, "fit.csv", 4.0, 1), tmp_path / "still.csv")
+    assert [effect["name"] for effect in report["effects"]] == ["drive_coulomb_friction"]
+    assert any("proves nothing" in note for note in report["notes"])
+    assert report["fit"]["holdout"]["gap_closed"] > 0.95
+
+
 def test_nothing_missing_is_an_empty_patch_without_harm(tmp_path: Path) -> None:
     """Before and after are the same."""
     report = analyse(tmp_path, sled(tmp_path, "fit.csv", 0.0, 3), sled(tmp_path, "other.csv", 0.0, 4))

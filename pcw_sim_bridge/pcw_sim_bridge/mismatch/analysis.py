@@ -94,6 +94,7 @@ def analyse(
     prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
     proof = prover.prove(explanation)
     explanation = proof.explanation
+    problem = explanation.search.problem
     instances = [_instance(named) for named in explanation.named]
     retuned = _retuned(problem, explanation.fit)
     patched = subject.patched(instances, _reported_numbers(explanation)) if instances else subject
@@ -124,9 +125,9 @@ def analyse(
         ladder=(*_ladder(explanation.selection.ladder), *proof.dropped),
         traces=(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
-            *(_traces(proof.held_out.problem, proof.predicted, explanation.fit, "holdout") if held_out else ()),
+            *(_traces(prover.other, proof.predicted, explanation.fit, "holdout") if prover.other is not None else ()),
         ),
-        notes=_notes(explanation, retuned, bool(held_out), proof),
+        notes=_notes(explanation, retuned, prover.other is not None, proof),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),

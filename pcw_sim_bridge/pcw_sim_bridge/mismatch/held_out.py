@@ -25,7 +25,7 @@ class HeldOut:
 
     Attributes:
         problem: that is judged.
-        instances: the effects, as the fitted problem has them.
+        instances: the effects, as the fitted problem has them; only those `proposed` count, others are fitted beside them.
         columns: of nuisances and effects in `problem` (T, C, k); an effect that it does not show has zeros.
         fold: which fold judges each sample (T,).
         train, test: Gram matrices of [columns, residual], whitened, per fold (F, k + 1, k + 1).
@@ -35,6 +35,7 @@ class HeldOut:
 
     problem: RegressionProblem
     instances: tuple[Instance, ...]
+    proposed: tuple[int, ...]
     columns: FloatArray
     fold: IntArray
     train: FloatArray
@@ -45,7 +46,12 @@ class HeldOut:
 
     @classmethod
     def recordings(
-        cls, problem: RegressionProblem, instances: Sequence[Instance], selection: Selection, other: RegressionProblem
+        cls,
+        problem: RegressionProblem,
+        instances: Sequence[Instance],
+        proposed: Sequence[int],
+        selection: Selection,
+        other: RegressionProblem,
     ) -> HeldOut:
         """Hold out other recordings: fitted on all of `problem`, judged on `other`."""
         regression = selection.regression
@@ -58,6 +64,7 @@ class HeldOut:
         return cls(
             other,
             tuple(instances),
+            tuple(proposed),
             columns,
             everything,
             regression.grams(instances).sum(axis=0)[None],
@@ -68,7 +75,9 @@ class HeldOut:
         )
 
     @classmethod
-    def manoeuvres(cls, problem: RegressionProblem, instances: Sequence[Instance], selection: Selection) -> HeldOut:
+    def manoeuvres(
+        cls, problem: RegressionProblem, instances: Sequence[Instance], proposed: Sequence[int], selection: Selection
+    ) -> HeldOut:
         """Hold out manoeuvres of the fitted recordings in turn, each judged by a fit to the others."""
         number = manoeuvres(problem)
         regression = WhitenedRegression(problem, selection.regression.noise, np.ones_like(problem.residual), number)
@@ -79,6 +88,7 @@ class HeldOut:
         return cls(
             problem,
             tuple(instances),
+            tuple(proposed),
             _columns_elsewhere(problem, instances, problem),
             number % FOLDS,
             test.sum(axis=0) - test,
@@ -108,8 +118,11 @@ class HeldOut:
         return found
 
     def predicted(self, means: FloatArray) -> FloatArray:
-        """What nuisances and effects add to the nominal prediction (T, C), each sample by its own fold."""
-        total = np.zeros_like(self.problem.residual)
+        """What nuisances and proposed effects add to the nominal prediction (T, C), each sample by its own fold."""
+        total, means = np.zeros_like(self.problem.residual), means.copy()
+        for index in range(len(self.instances)):
+            if index not in self.proposed:
+                means[:, slice(*self.span(index))] = 0.0
         for fold, mean in enumerate(means):
             rows = self.fold == fold
             total[rows] = self.columns[rows] @ mean

@@ -27,6 +27,7 @@ from .whitened_regression import Instance
 
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
+LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
 
@@ -92,6 +93,9 @@ class Prover:
         """
         self.subject, self.retune, self.reduce, self.rng = subject, retune, reduce, rng
         self.other = subject.problem(held_out) if held_out else None
+        self.unusable = self.other is not None and self.other.valid.any(axis=1).sum() < LEAST_DURATION * self.other.rate
+        if self.unusable:
+            self.other, held_out = None, ()
         self.windows = subject.windows(held_out or opened)
         if self.windows is not None and not len(self.windows.begin):
             self.windows = None
@@ -131,7 +135,10 @@ class Prover:
     def _held_out(self, explanation: Explanation) -> HeldOut:
         """The folds for the effects of an explanation that last; the time of the others is taken out of the data."""
         problem, selection = explanation.search.problem, explanation.selection
-        lasting = [i for i in selection.fit.instances if not is_event(problem.terms[i.term].effect)]
+        events = {named.instance for named in explanation.named if is_event(named.term.effect)}
+        lasting = [instance for instance in selection.fit.instances if instance not in events]
+        named = {entry.instance for entry in explanation.named}
+        proposed = [index for index, instance in enumerate(lasting) if instance in named]
         if self.other is not None:
             names = [[c.name for c in p.channels] for p in (problem, self.other)]
             if names[0] != names[1]:
@@ -140,10 +147,10 @@ class Prover:
                     f"channels {differ} are only in the fitted or only in the held-out recordings; allowed: recordings with "
                     "the same sensors in one analysis"
                 )
-            return HeldOut.recordings(problem, lasting, selection, self.other)
+            return HeldOut.recordings(problem, lasting, proposed, selection, self.other)
         busy = _busy(explanation)
         quiet = dataclasses.replace(problem, valid=problem.valid & ~busy[:, None]) if busy.any() else problem
-        return HeldOut.manoeuvres(quiet, lasting, selection)
+        return HeldOut.manoeuvres(quiet, lasting, proposed, selection)
 
     def _quiet_windows(self, explanation: Explanation) -> Windows | None:
         """The windows, with nothing to judge in them while an event was at work."""
@@ -160,8 +167,8 @@ class Prover:
 
     def _useless(self, held_out: HeldOut) -> tuple[int, str] | None:
         """The effect that adds most to the held-out error, if one adds to it."""
-        helps = [held_out.help_of(index) for index in range(len(held_out.instances))]
-        found = [(nats, index) for index, (nats, work) in enumerate(helps) if work > AT_WORK and nats <= 0.0]
+        helps = [(*held_out.help_of(index), index) for index in held_out.proposed]
+        found = [(nats, index) for nats, work, index in helps if work > AT_WORK and nats <= 0.0]
         return (min(found)[1], "the error is no smaller with it") if found else None
 
     def _misleading(
@@ -169,7 +176,7 @@ class Prover:
     ) -> tuple[int, str] | None:
         """Where the simulation follows less well with the patch: the effect without which it follows best."""
         windows = self._quiet_windows(explanation)
-        if windows is None or self.before is None or after is None or not held_out.instances:
+        if windows is None or self.before is None or after is None or not held_out.proposed:
             return None
 
         def errors(squares: FloatArray) -> PairedErrors:
@@ -178,15 +185,18 @@ class Prover:
 
         if errors(after).worse()[0] == 0.0:
             return None
-        without = [self._rollout(explanation, held_out, index) for index in range(len(held_out.instances))]
-        follows = [float(errors(squares).after[0]) for squares in without if squares is not None]
-        return int(np.argmin(follows)), "the simulation follows less well with it"
+        follows = []
+        for index in held_out.proposed:
+            squares = self._rollout(explanation, held_out, index)
+            assert squares is not None
+            follows.append((float(errors(squares).after[0]), index))
+        return min(follows)[1], "the simulation follows less well with it"
 
     def _rollout(self, explanation: Explanation, held_out: HeldOut, without: int | None = None) -> FloatArray | None:
         """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""
         if self.windows is None or self.before is None:
             return None
-        if not held_out.instances:
+        if not held_out.proposed:
             return self.before
         fold = _fold_of(held_out, self.windows)
         after = np.full_like(self.before, np.nan)
@@ -208,9 +218,10 @@ class Prover:
     ) -> Subject:
         """The description with the effects and numbers that one fold found."""
         effects = []
-        for index, instance in enumerate(held_out.instances):
+        for index in held_out.proposed:
             if index == without:
                 continue
+            instance = held_out.instances[index]
             term, values = problem.terms[instance.term], mean[slice(*held_out.span(index))]
             names = [term.parameters[k].name for k in instance.active]
             found = dict(instance.shape) | dict(zip(names, map(float, values), strict=True))
@@ -226,9 +237,14 @@ class Prover:
 
     def _remarks(self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None) -> list[str]:
         remarks = []
-        for index, instance in enumerate(held_out.instances):
+        if self.unusable:
+            remarks.append(
+                f"What was given to hold out has less than {LEAST_DURATION:g} s of usable motion and proves nothing: "
+                "manoeuvres of the fitted recordings are held out instead."
+            )
+        for index in held_out.proposed:
             if held_out.help_of(index)[1] <= AT_WORK:
-                label = explanation.search.label(instance)
+                label = explanation.search.label(held_out.instances[index])
                 remarks.append(f"{label} was not at work in what was held out: nothing there speaks for it or against it.")
         for name in dict.fromkeys(n.term.effect for n in explanation.named if is_event(n.term.effect)):
             remarks.append(f"{name} comes once, from outside: the time in which it acts is left out of the proof.")
@@ -288,7 +304,7 @@ class Prover:
             return (), None
         retuned = self.retune(explanation)
         model = self._patched(explanation.search.problem, held_out, held_out.means().mean(axis=0), retuned, None)
-        noise = windows.relative((model if held_out.instances else self.subject).rollout_floor(windows, self.rng))
+        noise = windows.relative((model if held_out.proposed else self.subject).rollout_floor(windows, self.rng))
         counts = np.maximum(np.isfinite(noise).sum(axis=0), 1)
         floors = np.nansum(noise, axis=0) / counts
         found, gap = [], None
