@@ -16,7 +16,7 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 
 from .errors import MismatchError
-from .explanation import Explanation
+from .explanation import AMBIGUOUS, Explanation
 from .findings import ChannelProof, FitFinding, LadderFinding, RolloutProof
 from .held_out import HeldOut
 from .paired_errors import PairedErrors, blocks_of, gap_closed, interval
@@ -112,7 +112,7 @@ class Prover:
         while True:
             held_out = self._held_out(explanation)
             after = None
-            useless = self._useless(held_out)
+            useless = self._useless(explanation, held_out)
             if useless is None:
                 after = self._rollout(explanation, held_out)
                 useless = self._misleading(explanation, held_out, after)
@@ -165,10 +165,17 @@ class Prover:
 
     # -- what stays -------------------------------------------------------------------------------------------------
 
-    def _useless(self, held_out: HeldOut) -> tuple[int, str] | None:
-        """The effect that adds most to the held-out error, if one adds to it."""
-        helps = [(*held_out.help_of(index), index) for index in held_out.proposed]
-        found = [(nats, index) for nats, work, index in helps if work > AT_WORK and nats <= 0.0]
+    def _useless(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
+        """The effect that adds most to the held-out error, if one adds to it.
+
+        Against one that is said to be ambiguous the held-out data have to speak as clearly as look-alikes are separated.
+        """
+        doubted = {named.instance for named in explanation.named if named.ambiguous_with}
+        found = []
+        for index in held_out.proposed:
+            nats, work = held_out.help_of(index)
+            if work > AT_WORK and nats <= (-AMBIGUOUS if held_out.instances[index] in doubted else 0.0):
+                found.append((nats, index))
         return (min(found)[1], "the error is no smaller with it") if found else None
 
     def _misleading(
