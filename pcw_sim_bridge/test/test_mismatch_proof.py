@@ -330,6 +330,8 @@ def test_a_standstill_proves_nothing_and_manoeuvres_are_held_out_instead(tmp_pat
     assert [effect["name"] for effect in report["effects"]] == ["drive_coulomb_friction"]
     assert any("proves nothing" in note for note in report["notes"])
     assert report["fit"]["holdout"]["gap_closed"] > 0.95
+    (tmp_path / "second").mkdir()
+    assert analyse(tmp_path / "second", tmp_path / "still.csv")["verdict"] == "insufficient_data"
 
 
 def test_nothing_missing_is_an_empty_patch_without_harm(tmp_path: Path) -> None:
