@@ -5,7 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcw_description.axis_recording import AxisDescription, AxisRecordingError, parse_axis_description, read_axis_recording
+from pcw_description.axis_recording import (
+    AxisDescription,
+    AxisRecordingError,
+    parse_axis_description,
+    read_axis_recording,
+)
 from pcw_description.errors import DescriptionError
 
 BASE = {
@@ -111,7 +116,10 @@ def test_a_broken_file_is_an_error(tmp_path: Path, name: str, content: bytes, sa
         ({"columns": {"position": "q", "force": "i"}}, "time column or a rate"),
         ({"rate": 100.0}, "time column or a rate"),
         ({"columns": {"time": "t", "postion": "q", "force": "i"}}, "position"),
-        ({"kind": "linear", "columns": {"time": "t", "position": "q", "force": "i"}, "gravity_arm": {"moment": 1.0}}, "gravity"),
+        (
+            {"kind": "linear", "columns": {"time": "t", "position": "q", "force": "i"}, "gravity_arm": {"moment": 1.0}},
+            "gravity",
+        ),
         ({"tolerances": {"hanging_position": "0.1 rad", "inertai": "5 %"}}, "inertia"),
     ],
 )

@@ -14,6 +14,7 @@ from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
 from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.bench_cases import BenchCase, draw_bench_case
+from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.explanation import Explanation, explain
 from pcw_sim_bridge.mismatch.findings import Findings
 
@@ -159,7 +160,7 @@ ARM = {"right": {}, "heavy": {"moment": 1.3}}
 def test_a_servo_with_an_arm(described: str, effects: tuple[str, ...]) -> None:
     """Gear friction and Stribeck friction are told under a load that changes with the angle; a wrong moment is re-tuned."""
     case = draw_bench_case(
-        np.random.default_rng(3), effects, 0.4, motion="sines", kind="rotary", travel=2.0, gravity=2.0, noise=0.03,
+        np.random.default_rng(3), effects, 0.4, motion="sines", kind="rotary", travel=2.0, gravity=2.0, noise=0.01,
         described_arm=ARM[described],
     )
     explanation = explained(case)
@@ -181,3 +182,22 @@ def test_an_arm_that_the_description_lacks_or_has_wrong_depends_on_the_angle(des
     assert entry.estimates["order"].value == 1.0
     values = {name: estimate.value for name, estimate in entry.estimates.items()}
     assert "gravity on an arm of" in AxisSubject(case.axis).statement(effect("motor_cogging", **values))
+
+
+def with_signals(case: BenchCase, position: np.ndarray, force: np.ndarray) -> AxisProblemBuilder:
+    """Return the builder of a case with other signals in its recording."""
+    recordings = [dataclasses.replace(case.recordings[0], position=position, force=force)]
+    return AxisProblemBuilder(case.axis, recordings)
+
+
+def test_an_axis_that_stands_still_has_nothing_to_judge() -> None:
+    """Noise on a position that does not change is no motion, and a force of zero is no drive."""
+    rng = np.random.default_rng(0)
+    case = draw_bench_case(rng, kind="rotary")
+    size = len(case.recordings[0].time)
+    force = 0.01 * rng.standard_normal(size)
+    for position in (np.ones(size), 1.0 + 1e-4 * rng.standard_normal(size)):
+        builder = with_signals(case, position, force)
+        assert not builder.build(builder.choose_smoothing()).valid.any()
+    with pytest.raises(MismatchError, match="the force is 0 throughout"):
+        with_signals(case, case.recordings[0].position, np.zeros(size))

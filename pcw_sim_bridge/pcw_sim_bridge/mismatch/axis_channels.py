@@ -109,7 +109,8 @@ def axis_motion(
         speed = derivative(position, rate) if recording.velocity is None else wide.smooth(values[:, 1])
         fine = refined(np.stack([position, speed, derivative(speed, rate), force], axis=1), factor)
         position, speed, acceleration, force = fine.T
-        floor = max(4.0 * creep, 2e-3 * float(np.max(np.abs(speed))))
+        rounding = 1e-12 * float(np.max(np.abs(position))) * factor * rate
+        floor = max(4.0 * creep, 2e-3 * float(np.max(np.abs(speed))), rounding)
         motions.append(
             AxisMotion(
                 recording=index,
@@ -118,7 +119,7 @@ def axis_motion(
                 velocity=speed,
                 acceleration=acceleration,
                 force=force,
-                still=_long_runs(np.abs(speed) < floor, int(0.05 * factor * rate)),
+                still=_long_runs(np.abs(speed) <= floor, int(0.05 * factor * rate)),
             )
         )
     return factor * rate, motions
@@ -146,8 +147,11 @@ class AxisProblemBuilder:
             cutoff: of the channel filter [Hz]; None chooses it from the noise of the recordings.
 
         Raises:
-            MismatchError: no recording has a piece long enough.
+            MismatchError: no recording has a piece long enough, or one has no force.
         """
+        for recording in recordings:
+            if not np.any(recording.force + recording.external_force):
+                raise MismatchError(f"{recording.path}: the force is 0 throughout; allowed: a drive that works")
         self.axis, self.recordings = axis, tuple(recordings)
         self.cutoff = cutoff if cutoff is not None else choose_cutoff(axis, recordings)
         rates_and_motions = [
@@ -219,6 +223,8 @@ class AxisProblemBuilder:
 
     def choose_smoothing(self) -> float:
         """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares."""
+        if not self._valid.any():
+            return 1.0
         frictions = [
             e for e in candidate_effects() if e.parameters and SMOOTHING in {p.name for p in e.parameters}
         ]
@@ -235,6 +241,7 @@ class AxisProblemBuilder:
         fixed = [self._acceleration[:, None], self._skew()[:, None]]
         fixed += [self._columns(all_effects()[name], {})[:, 0, :] for name in companions]  # type: ignore[arg-type]
         fixed += self._periodic_columns
+        fixed += [column[:, None] for column in self._gravity()]
 
         def misfit(smoothing: float) -> float:
             # Further shapes are tried, too: a curve of the wrong width would be mended by the smoothing.
@@ -291,6 +298,13 @@ class AxisProblemBuilder:
                 columns.append(term.columns(term.shapes[best])[:, 0, :])
         return found
 
+    def _gravity(self) -> list[FloatArray]:
+        """Sine and cosine of the angle from where the arm hangs, (T,) each; none without an arm."""
+        if self.axis.gravity_arm is None:
+            return []
+        angles = [m.position - self.axis.gravity_arm.hanging_position for m in self.motions]
+        return [self._filtered([function(angle) for angle in angles]) for function in (np.sin, np.cos)]
+
     def _skew(self) -> FloatArray:
         """What a force measured later than it acts adds per second of delay (T,): F(t - d) = F(t) - d F'(t).
 
@@ -315,12 +329,12 @@ class AxisProblemBuilder:
         ]
         if axis.gravity_arm is not None:
             arm = axis.gravity_arm
-            shape = self._filtered([np.sin(m.position - arm.hanging_position) for m in self.motions])
+            shape, across = self._gravity()
             predicted = predicted + arm.moment * shape
             deviation = _deviation(axis, "gravity_moment", arm.moment)
             nuisances.append(Nuisance("gravity_moment", "N m", arm.moment, deviation, shape[:, None]))
-            lean = self._filtered([-arm.moment * np.cos(m.position - arm.hanging_position) for m in self.motions])
             deviation = _deviation(axis, "hanging_position", 1.0)
+            lean = -arm.moment * across
             nuisances.append(Nuisance("hanging_position", "rad", arm.hanging_position, deviation, lean[:, None]))
         skew = self._skew()
         period = min(float(np.median(np.diff(recording.time))) for recording in self.recordings)

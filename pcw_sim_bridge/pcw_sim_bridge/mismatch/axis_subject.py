@@ -67,9 +67,9 @@ class AxisSubject:
         sentence = get(instance.name).statement(("the axis",), instance.parameters)
         if self.axis.kind == "rotary" and instance.parameters.get("order") == 1.0:
             cosine, sine = instance.parameters["cosine"], instance.parameters["sine"]
-            sentence = sentence.removesuffix(".") + (
-                f", or gravity on an arm of {math.hypot(cosine, sine):.3g} N m that hangs at {math.atan2(cosine, -sine):.3g} rad."
-            )
+            moment, hanging = math.hypot(cosine, sine), math.atan2(cosine, -sine)
+            gravity = f"gravity on an arm of {moment:.3g} N m that hangs at {hanging:.3g} rad"
+            sentence = f"{sentence.removesuffix('.')}, or {gravity}."
         sentence = sentence.replace("the drive of the axis", "the axis")
         for index, unit in enumerate(_LINEAR_WORDS):
             sentence = sentence.replace(f" {unit}", f" \0{index}")

@@ -170,6 +170,9 @@ def draw_bench_case(
         for name in effects
     )
     resolution = travel * 10.0 ** rng.uniform(-6.0, -4.3)
+    arm = {}
+    if described_arm is not None:
+        arm = {"gravity_arm": {**described_arm, "moment": moment * described_arm.get("moment", 1.0)}}
     axis = parse_axis_description(
         {
             "format": "pcw_axis/1",
@@ -180,7 +183,7 @@ def draw_bench_case(
             "inertia": inertia,
             "tolerances": {"inertia": "2 %"},
         }
-        | ({} if described_arm is None else {"gravity_arm": {**described_arm, "moment": moment * described_arm.get("moment", 1.0)}})
+        | arm
     )
     true_inertia = inertia * (1.0 + 0.02 * float(np.clip(rng.standard_normal(), -2.5, 2.5)))
     level = noise if noise is not None else 10.0 ** rng.uniform(-2.3, -1.3)

@@ -152,7 +152,9 @@ def explain(
         kept = [other for other in selection.fit.instances if other != instance]
         selection = search.conclude(kept, selection.threshold)
         result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
-    suspect, undecided, remarks = None, {}, ()
+    suspect: Refinement | None = None
+    undecided: dict[Instance, float] = {}
+    remarks: tuple[str, ...] = ()
     refined = _refined(search, selection, result)
     if refined is not None:
         finished = OpenSetTest(search, refined.instances).run(selection.threshold)
@@ -240,7 +242,9 @@ def _remarks(search: EffectSearch, plain: Selection, refined: _Refined) -> tuple
             f"{term.parameters[k].name} = {value:.3g} {term.parameters[k].unit}"
             for k, value in zip(instance.active, values, strict=True)
         )
-        remarks.append(f"With a symmetric {law} there would be {term.effect} ({numbers}); with the refined one the recordings {fate}.")
+        remarks.append(
+            f"With a symmetric {law} there would be {term.effect} ({numbers}); with the refined one the recordings {fate}."
+        )
     return tuple(remarks)
 
 
