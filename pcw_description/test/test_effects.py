@@ -255,6 +255,19 @@ def test_effect_of_another_package_is_found(install: Any) -> None:
     assert "drive_coulomb_friction" in all_effects()
 
 
+def test_an_effect_can_be_known_for_a_while() -> None:
+    """Whoever conceals an effect in a simulator leaves the vocabulary as it was, also after an error."""
+    before = dict(all_effects())
+    with pytest.raises(RuntimeError), registry.also_known([third_party_effect("steering_spring")]):
+        assert get("steering_spring").name == "steering_spring"
+        raise RuntimeError
+    assert all_effects() == before
+    taken = third_party_effect("constant_load")
+    with pytest.raises(DescriptionError, match="each name once"), registry.also_known([taken]):
+        pass
+    assert all_effects() == before
+
+
 def test_effect_of_another_package_may_not_change_a_name(install: Any) -> None:
     install(third_party_effect("constant_load"))
     with pytest.raises(DescriptionError, match=r"other_package\.spring:EFFECT: 'constant_load' .* each name once"):

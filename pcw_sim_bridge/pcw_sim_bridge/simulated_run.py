@@ -5,13 +5,15 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Protocol
 
 from pcw_description.recording_writer import RecordingWriter
 from pcw_description.robot_description import FloatArray, RobotDescription
 from pcw_description.ros_messages import imu, joint_state, odometry, twist_stamped
 
 from .plants.factory import make_plant
-from .run_controllers import make_controller
+from .plants.plant import Plant
+from .run_controllers import RunController, make_controller
 from .sensors import ImuReading, JointReading
 from .simulated_robot import JointCommand, Sample, SimulatedRobot, TrackedPose
 from .stamping import StampingParameters, TopicStamps
@@ -19,6 +21,42 @@ from .stamping import StampingParameters, TopicStamps
 CommandedTwist = Callable[[float], FloatArray | None]
 # A stamp of zero means "no stamp" in ROS, so recordings begin at one second [ns].
 START_NS = 1_000_000_000
+
+
+class RunSink(Protocol):
+    """Takes what a robot and its controller send while it is driven."""
+
+    def sample(self, sample: Sample) -> None:
+        """Take one reading."""
+
+    def answer(self, time_ns: int, twist: FloatArray | None, command: JointCommand) -> None:
+        """Take what was wanted at a time [ns], and the command that answers the last joint reading."""
+
+
+def drive(
+    simulated: SimulatedRobot,
+    controller: RunController,
+    commanded_twist: CommandedTwist,
+    duration: float,
+    sink: RunSink,
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """Drive a simulated robot along a commanded twist for `duration` [s]; see `record_run`.
+
+    Raises:
+        PlantError: the plant leaves what it can compute.
+    """
+    while simulated.time_ns < duration * 1e9:
+        for sample in simulated.advance():
+            sink.sample(sample)
+            if not isinstance(sample.reading, JointReading):
+                continue
+            twist = commanded_twist(sample.time_ns * 1e-9)
+            command = controller.command(sample.reading, twist, simulated.control_period)
+            simulated.command(command)
+            sink.answer(sample.time_ns, twist, command)
+        if progress is not None:
+            progress(simulated.time_ns * 1e-9)
 
 
 def record_run(
@@ -33,6 +71,7 @@ def record_run(
     stamping: StampingParameters | None = None,
     lifted: bool = False,
     progress: Callable[[float], None] | None = None,
+    plant: Plant | None = None,
 ) -> Mapping[str, int]:
     """Drive a robot along a commanded twist and write the recording that a real one would have left.
 
@@ -50,6 +89,7 @@ def record_run(
         stamping: of what is recorded; default: exact, and nothing lost. The controller is on board and loses nothing.
         lifted: the robot is jacked up, its wheels off the ground.
         progress: called with the simulated time [s] after each control period.
+        plant: of `robot`, instead of one made by `plant_name`; it is closed.
 
     Returns:
         Number of messages by topic.
@@ -58,24 +98,14 @@ def record_run(
         RecordingError: `path` exists or cannot be written.
         PlantError: the plant or the controller cannot be made, or the plant leaves what it can compute.
     """
-    simulated = SimulatedRobot(make_plant(plant_name, robot, lifted=lifted), seed)
+    simulated = SimulatedRobot(plant or make_plant(plant_name, robot, lifted=lifted), seed)
     try:
         controller = make_controller(controller_name, controlled_as or robot)
         writer = RecordingWriter(path, flush_interval=None)
         try:
             with writer:
                 recorder = _Recorder(writer, robot, TopicStamps(stamping or StampingParameters(), seed, robot))
-                while simulated.time_ns < duration * 1e9:
-                    for sample in simulated.advance():
-                        recorder.sample(sample)
-                        if not isinstance(sample.reading, JointReading):
-                            continue
-                        twist = commanded_twist(sample.time_ns * 1e-9)
-                        command = controller.command(sample.reading, twist, simulated.control_period)
-                        simulated.command(command)
-                        recorder.answer(sample.time_ns, twist, command)
-                    if progress is not None:
-                        progress(simulated.time_ns * 1e-9)
+                drive(simulated, controller, commanded_twist, duration, recorder, progress)
         except BaseException:
             shutil.rmtree(writer.path)
             raise

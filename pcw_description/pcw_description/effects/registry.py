@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.metadata
 import pkgutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..effect_instance import EffectInstance
@@ -29,6 +30,25 @@ def all_effects() -> Mapping[str, Effect]:
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
         _add(effects, entry_point.load(), entry_point.value)
     return dict(sorted(effects.items()))
+
+
+@contextlib.contextmanager
+def also_known(effects: Iterable[Effect]) -> Iterator[None]:
+    """Take effects into the vocabulary for a while, so that a simulator can do what nobody else is to know.
+
+    Raises:
+        DescriptionError: not an effect, or a name that is taken.
+    """
+    vocabulary = all_effects()
+    assert isinstance(vocabulary, dict)  # the cached one, which all callers see
+    before = dict(vocabulary)
+    try:
+        for effect in effects:
+            _add(vocabulary, effect, f"{effect.name} for a while")
+        yield
+    finally:
+        vocabulary.clear()
+        vocabulary.update(before)
 
 
 def _add(effects: dict[str, Effect], effect: object, origin: str) -> None:

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 from pcw_description.errors import PcwError
 
-from .commands import analyze
+from .commands import analyze, challenge
 
-COMMANDS = (analyze,)
+COMMANDS = (analyze, challenge)
 
 
 def parser() -> argparse.ArgumentParser:

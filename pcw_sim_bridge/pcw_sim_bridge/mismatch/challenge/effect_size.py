@@ -1,0 +1,115 @@
+"""How large an effect is in the channels of the analyser: the same run with the same noise, with it and without.
+
+    size = max over channels of rms(residual with - residual without) / noise floor
+
+The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. An effect may be large
+and yet be no more than re-tuning within tolerances explains; `evidence` says what that explanation would cost [nats]:
+
+    1/2 min over nu of ( |change - N nu|^2 / floor^2 + |nu / tolerance|^2 ).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pcw_description.robot_description import RobotDescription
+
+from ..regression_problem import BoolArray, FloatArray, RegressionProblem
+from ..robot_channels import RobotProblemBuilder
+from .simulated_case import SimulatedRecording
+
+# A part of the samples in which an effect does nothing is no part of its region.
+REGION_QUANTILES = (0.01, 0.99)
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectSize:
+    """How an effect shows.
+
+    Attributes:
+        size: see above; channel: the one in which it is largest.
+        evidence: see above [nats].
+        region: range of every variable where the effect is above the noise floor.
+        retuned: the re-tuning that hides it best, in the units of the analyser's `retuned`, by name.
+    """
+
+    size: float
+    channel: str
+    evidence: float
+    region: dict[str, tuple[float, float]]
+    retuned: dict[str, float]
+
+
+class HealthyChannels:
+    """The channels of a case's healthy runs, and their noise floor."""
+
+    def __init__(self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording]) -> None:
+        self._nominal = nominal
+        builder = RobotProblemBuilder(nominal, list(recordings))  # type: ignore[arg-type]
+        self._cutoff = builder.cutoff
+        self.problem = builder.build()
+        self._columns = self.problem.nuisance_columns()
+        self._deviations = self.problem.nuisance_deviations()
+        self.floor = self._noise_floor()
+
+    def size(self, recordings: Sequence[SimulatedRecording]) -> EffectSize:
+        """Return how large an effect is that these runs have and the healthy ones have not."""
+        problem = self.problem
+        with_effect = _build(self._nominal, recordings, self._cutoff)
+        length = min(len(problem.residual), len(with_effect.residual))
+        change = np.zeros_like(problem.residual)
+        change[:length] = with_effect.residual[:length] - problem.residual[:length]
+        rows = problem.valid & np.isfinite(change)
+        relative = _rms(change, rows) / self.floor
+        largest = int(np.argmax(relative))
+        rest, moved = self._retuned(change, rows, self.floor)
+        left = np.where(rows, rest / self.floor, 0.0)
+        active = np.any(rows & (np.abs(change) > self.floor), axis=1)
+        return EffectSize(
+            size=float(relative[largest]),
+            channel=problem.channels[largest].name,
+            evidence=0.5 * float(np.sum(left**2) + np.sum((moved / self._deviations) ** 2)),
+            region=_regions(problem, active),
+            retuned={n.name: float(value) for n, value in zip(problem.nuisances, moved, strict=True)},
+        )
+
+    def _noise_floor(self) -> FloatArray:
+        residual, valid = self.problem.residual, self.problem.valid
+        floor = np.maximum(_rms(residual, valid), 1e-12)
+        for _ in range(4):  # the weights of the re-tuning are the floor that it leaves
+            rest, _ = self._retuned(residual, valid, floor)
+            floor = np.maximum(_rms(rest, valid), 1e-12)
+        return floor
+
+    def _retuned(self, values: FloatArray, rows: BoolArray, floor: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what re-tuning within tolerances leaves of values (T, C), and the re-tuning (K,)."""
+        columns = np.where(rows[:, :, None], self._columns / floor[:, None], 0.0).reshape(-1, len(self._deviations))
+        scaled = columns * self._deviations
+        wanted = np.where(rows, values / floor, 0.0).ravel()
+        solution = np.linalg.solve(scaled.T @ scaled + np.eye(scaled.shape[1]), scaled.T @ wanted)
+        moved = self._deviations * solution
+        return values - self._columns @ moved, moved
+
+
+def _build(nominal: RobotDescription, recordings: Sequence[SimulatedRecording], cutoff: float) -> RegressionProblem:
+    return RobotProblemBuilder(nominal, list(recordings), cutoff).build()  # type: ignore[arg-type]
+
+
+def _rms(values: FloatArray, rows: BoolArray) -> FloatArray:
+    """Root mean square per channel, (C,)."""
+    counts = np.maximum(rows.sum(axis=0), 1)
+    rms: FloatArray = np.sqrt(np.sum(np.where(rows, values, 0.0) ** 2, axis=0) / counts)
+    return rms
+
+
+def _regions(problem: RegressionProblem, active: BoolArray) -> dict[str, tuple[float, float]]:
+    if not active.any():
+        return {}
+    found = {}
+    for name, values in problem.variables.items():
+        low, high = np.quantile(values[active], REGION_QUANTILES)
+        found[name] = (float(low), float(high))
+    return found

@@ -1,0 +1,237 @@
+"""How a healthy robot differs from its description: every number that has a tolerance, moved within it.
+
+Numbers of the description are changed in it; what a description does not hold (a steering zero, a gain, a bias, the floor)
+is put under `physics`. Deviations are kept by name, so that an answer file can state them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.registry import get
+from pcw_description.errors import DescriptionError
+from pcw_description.robot_description import AXIS_NAMES, Caster, ContactDescription, RobotDescription
+
+Change = Callable[[RobotDescription, float], RobotDescription]
+# Healthy robots are no further off than this, in standard deviations; a tyre's stiffness cannot vanish.
+LARGEST_DEVIATION = 2.5
+LARGEST_STIFFNESS_DEVIATION = 1.4
+
+
+@dataclasses.dataclass(frozen=True)
+class HealthyNumber:
+    """A number that a healthy robot may differ in.
+
+    Attributes:
+        name: as the analyser calls it under `retuned`, where it does.
+        deviation: one standard deviation; of `rotors.*` and `contact.*` relative to the number.
+        change: (robot, deviation) -> robot.
+        described: the number stands in the description, so that somebody may have tuned it there.
+    """
+
+    name: str
+    deviation: float
+    change: Change
+    described: bool = True
+
+
+def healthy_numbers(robot: RobotDescription) -> tuple[HealthyNumber, ...]:
+    """Return every number of a robot that has a tolerance."""
+    found = [*_shared_numbers(robot)]
+    for caster in robot.casters:
+        found += _caster_numbers(robot, caster)
+    if robot.sensors.imu is not None:
+        found += _imu_numbers(robot)
+    return tuple(found)
+
+
+def draw_deviations(robot: RobotDescription, rng: np.random.Generator) -> dict[str, float]:
+    """Draw how far a healthy robot is off, by the names of `healthy_numbers`."""
+    drawn = {}
+    for number in healthy_numbers(robot):
+        widest = LARGEST_STIFFNESS_DEVIATION if number.name == "contact.stiffness" else LARGEST_DEVIATION
+        drawn[number.name] = number.deviation * float(np.clip(rng.standard_normal(), -widest, widest))
+    return drawn
+
+
+def with_deviations(robot: RobotDescription, deviations: Mapping[str, float]) -> RobotDescription:
+    """Return the robot as it really is.
+
+    Raises:
+        DescriptionError: a name that is none of `healthy_numbers`, or a robot that cannot be.
+    """
+    numbers = {number.name: number for number in healthy_numbers(robot)}
+    for name, deviation in deviations.items():
+        if name not in numbers:
+            raise DescriptionError("deviation", name, f"allowed: {', '.join(numbers)}")
+        if deviation != 0.0:
+            robot = numbers[name].change(robot, deviation)
+    return robot
+
+
+def effect_instance(
+    name: str, target: Sequence[str], parameters: Mapping[str, float], axis: str | None = None
+) -> EffectInstance:
+    """Return an effect with its defaults filled in.
+
+    Raises:
+        DescriptionError: a parameter that is unknown or out of its range.
+    """
+    return EffectInstance(name, tuple(target), get(name).check(dict(parameters), name), axis)
+
+
+def _tolerance(robot: RobotDescription, name: str, nominal: float) -> float:
+    known = robot.tolerance(name)
+    return known.value * abs(nominal) if known.relative else known.value
+
+
+def _replaced(part: Any, field: str, value: float) -> Any:
+    return dataclasses.replace(part, **{field: getattr(part, field) + value})
+
+
+def _entry(values: tuple[float, ...], index: int, value: float) -> Any:
+    """Return the tuple with one of its entries moved."""
+    return (*values[:index], values[index] + value, *values[index + 1 :])
+
+
+def _shared_numbers(robot: RobotDescription) -> list[HealthyNumber]:
+    """Numbers of the chassis, of all casters alike, of the ground."""
+    chassis, first = robot.chassis, robot.casters[0]
+
+    def of_chassis(field: str) -> Change:
+        return lambda r, value: dataclasses.replace(r, chassis=_replaced(r.chassis, field, value))
+
+    def centre(index: int) -> Change:
+        return lambda r, value: dataclasses.replace(
+            r, chassis=dataclasses.replace(r.chassis, com=_entry(r.chassis.com, index, value))
+        )
+
+    def of_all(part: str, field: str, nominal: float) -> Change:
+        """Change a number of all casters by the same part of it."""
+
+        def change(r: RobotDescription, value: float) -> RobotDescription:
+            def caster_changed(caster: Caster) -> Caster:
+                own = getattr(caster, part)
+                return dataclasses.replace(caster, **{part: _replaced(own, field, getattr(own, field) * value / nominal)})
+
+            return r.with_casters(r.caster_names, caster_changed)
+
+        return change
+
+    def slope(direction: float) -> Change:
+        return lambda r, value: _with_effect(
+            r, "ground_slope", ("chassis",), {"angle": abs(value), "direction": direction + (math.pi if value < 0.0 else 0.0)}
+        )
+
+    found = [
+        HealthyNumber("chassis.mass", _tolerance(robot, "chassis.mass", chassis.mass), of_chassis("mass")),
+        HealthyNumber(
+            "chassis.inertia_zz", _tolerance(robot, "chassis.inertia_zz", chassis.inertia_zz), of_chassis("inertia_zz")
+        ),
+        HealthyNumber("chassis.com.x", _tolerance(robot, "chassis.com", 0.0), centre(0)),
+        HealthyNumber("chassis.com.y", _tolerance(robot, "chassis.com", 0.0), centre(1)),
+        HealthyNumber("contact.mu_p", _tolerance(robot, "contact.mu_p", 1.0), _friction),
+        HealthyNumber("contact.stiffness", _tolerance(robot, "contact.stiffness", 1.0), _compliance),
+        HealthyNumber("ground.slope.x", _tolerance(robot, "ground.slope", 0.0), slope(0.0), described=False),
+        HealthyNumber("ground.slope.y", _tolerance(robot, "ground.slope", 0.0), slope(0.5 * math.pi), described=False),
+    ]
+    for name, part, field in (
+        ("module.mass", "module", "mass"),
+        ("module.inertia_zz", "module", "inertia_zz"),
+        ("wheel.inertia_axle", "wheel", "inertia_axle"),
+    ):
+        nominal = getattr(getattr(first, part), field)
+        found.append(HealthyNumber(name, _tolerance(robot, name, nominal), of_all(part, field, nominal)))
+    for axis in AXIS_NAMES:
+        found.append(HealthyNumber(f"rotors.{axis}", _tolerance(robot, "rotors", 1.0), of_all("rotors", axis, 1.0)))
+    return found
+
+
+def _caster_numbers(robot: RobotDescription, caster: Caster) -> list[HealthyNumber]:
+    name = caster.name
+
+    def own(field: str, index: int | None = None) -> Change:
+        def change(r: RobotDescription, value: float) -> RobotDescription:
+            if index is None:
+                return r.with_casters([name], lambda c: _replaced(c, field, value))
+            return r.with_casters(
+                [name], lambda c: dataclasses.replace(c, **{field: _entry(getattr(c, field), index, value)})
+            )
+
+        return change
+
+    def gain(axis: str) -> Change:
+        return lambda r, value: _with_effect(r, "torque_constant_error", (name,), {"error": value}, axis)
+
+    def zero(r: RobotDescription, value: float) -> RobotDescription:
+        return _with_effect(r, "steer_zero_offset", (name,), {"offset": value})
+
+    found = [
+        HealthyNumber(f"wheel_radius/{name}", _tolerance(robot, "wheel_radius", caster.wheel_radius), own("wheel_radius")),
+        HealthyNumber(f"steer_zero/{name}", _tolerance(robot, "steer_zero", 0.0), zero, described=False),
+    ]
+    for key in ("caster_offset", "steer_axis"):
+        for index, letter in enumerate("xy"):
+            found.append(HealthyNumber(f"{key}.{letter}/{name}", _tolerance(robot, key, 0.0), own(key, index)))
+    for axis in AXIS_NAMES:
+        deviation = _tolerance(robot, "torque_constant", 1.0)
+        found.append(HealthyNumber(f"torque_constant/{name}_{axis}", deviation, gain(axis), described=False))
+    return found
+
+
+def _imu_numbers(robot: RobotDescription) -> list[HealthyNumber]:
+    def place(index: int) -> Change:
+        def change(r: RobotDescription, value: float) -> RobotDescription:
+            assert r.sensors.imu is not None
+            moved = dataclasses.replace(r.sensors.imu, position=_entry(r.sensors.imu.position, index, value))
+            return dataclasses.replace(r, sensors=dataclasses.replace(r.sensors, imu=moved))
+
+        return change
+
+    def error(effect: str, parameter: str) -> Change:
+        return lambda r, value: _with_effect(r, effect, ("imu",), {"gyro": 0.0, parameter: value})
+
+    scale = _tolerance(robot, "imu.scale", 1.0)
+    found = [
+        HealthyNumber("imu.gyro_bias", _tolerance(robot, "imu.gyro_bias", 0.0), error("imu_bias", "gyro"), described=False),
+        HealthyNumber("imu.gyro_scale", scale, error("imu_scale", "gyro"), described=False),
+    ]
+    bias = _tolerance(robot, "imu.accelerometer_bias", 0.0)
+    for index, letter in enumerate("xy"):
+        key = f"accelerometer_{letter}"
+        found += [
+            HealthyNumber(f"imu.position.{letter}", _tolerance(robot, "imu.position", 0.0), place(index)),
+            HealthyNumber(f"imu.accelerometer_bias.{letter}", bias, error("imu_bias", key), described=False),
+            HealthyNumber(f"imu.accelerometer_scale.{letter}", scale, error("imu_scale", key), described=False),
+        ]
+    return found
+
+
+def _with_effect(
+    robot: RobotDescription, name: str, target: Sequence[str], parameters: Mapping[str, float], axis: str | None = None
+) -> RobotDescription:
+    return dataclasses.replace(robot, physics=(*robot.physics, effect_instance(name, target, parameters, axis)))
+
+
+def _friction(robot: RobotDescription, value: float) -> RobotDescription:
+    def change(tyre: ContactDescription) -> ContactDescription:
+        lateral = dataclasses.replace(tyre.lateral, mu_p=tyre.lateral.mu_p * (1.0 + value))
+        return dataclasses.replace(tyre, mu_p=tyre.mu_p * (1.0 + value), lateral=lateral)
+
+    return robot.with_tyres(robot.caster_names, change)
+
+
+def _compliance(robot: RobotDescription, value: float) -> RobotDescription:
+    """The slip that a force takes, more by `value` of it."""
+
+    def change(tyre: ContactDescription) -> ContactDescription:
+        lateral = dataclasses.replace(tyre.lateral, lambda_p=min(tyre.lateral.lambda_p * (1.0 + value), 1.0))
+        return dataclasses.replace(tyre, lambda_p=min(tyre.lambda_p * (1.0 + value), 1.0), lateral=lateral)
+
+    return robot.with_tyres(robot.caster_names, change)

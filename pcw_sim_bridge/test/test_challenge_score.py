@@ -1,0 +1,259 @@
+"""The score of a challenge, on answers and reports whose figures can be counted by hand."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pcw_description import load_robot
+from pcw_description.robot_file import robot_to_mapping
+from pcw_sim_bridge.mismatch.challenge.judgement import Judgement
+from pcw_sim_bridge.mismatch.challenge.score import (
+    Figure,
+    calibration_error,
+    figures,
+    missed,
+    overlap,
+    score,
+    wilson,
+)
+from pcw_sim_bridge.mismatch.challenge.score_page import page, text
+from pcw_sim_bridge.mismatch.challenge.sealed_answers import HASH_FILE, seal
+from pcw_sim_bridge.mismatch.errors import MismatchError
+
+ROBOT = robot_to_mapping(load_robot("thesis"))
+RUN = {"path": "recordings/run_1", "excitation": "chirps", "duration": 30.0, "seed": 1, "active": True}
+FRICTION = {"coulomb": 0.5, "asymmetry": 0.0, "smoothing_speed": 0.05}
+
+
+def concealed(name: str = "drive_coulomb_friction", target: str = "front_left", **changes: Any) -> dict[str, Any]:
+    return {
+        "name": name, "target": target.split("+"), "axis": None, "parameters": FRICTION, "outside": False, "size": 9.0,
+        "channel": "chassis_force/x", "evidence": 100.0, "region": {"speed": [0.0, 0.4]}, "onset": None, "place": None,
+        **changes,
+    }  # fmt: skip
+
+
+def answer(kind: str, *effects: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    return {
+        "case": "case_0001", "kind": kind, "masking": None, "plant": "reduced", "controller": "computed_torque",
+        "robot": "thesis", "noise": 1.0, "effects": list(effects), "deviations": {}, "retuned": {}, "nominal": ROBOT,
+        "true": ROBOT, "runs": [RUN], **changes,
+    }  # fmt: skip
+
+
+def named(name: str = "drive_coulomb_friction", target: str = "front_left", **changes: Any) -> dict[str, Any]:
+    parameters = {"coulomb": {"value": 0.51, "unit": "N m", "ci95": [0.48, 0.54]}}
+    return {
+        "name": name, "target": target.split("+"), "probability": 0.99, "parameters": parameters, "statement": "",
+        "ambiguous_with": [], "experiment": None, **changes,
+    }  # fmt: skip
+
+
+def report(*effects: dict[str, Any], unknown: tuple[dict[str, Any], ...] = (), **changes: Any) -> dict[str, Any]:
+    places = [
+        {"channels": [], "casters": e["target"], "axis": "drive", "intervals_s": [[4.0, 9.0]], "region": {"speed": [0.1, 0.4]},
+         "place_m": None}
+        for e in effects
+    ]  # fmt: skip
+    proof = {"source": "", "inverse_nrmse": [0.5, 0.1], "rollout": {"v_x": [0.4, 0.2]}, "gap_closed": 0.98}
+    return {
+        "verdict": "explained" if effects else "no_mismatch", "effects": list(effects), "locations": places,
+        "unknown": list(unknown), "fit": {"holdout": proof}, **changes,
+    }  # fmt: skip
+
+
+def leftover(variable: str, share: float = 0.5) -> dict[str, Any]:
+    return {"channel": "chassis_force/x", "depends_on": [variable], "expression": None, "share_explained": share}
+
+
+def judged(case: dict[str, Any], said: dict[str, Any] | None) -> Judgement:
+    return Judgement(case, said, {"seconds": 3.0, "cpu_seconds": 2.0, "peak_bytes": 2**28})
+
+
+def figure(cases: list[Judgement], section: int, label: str) -> Figure:
+    [found] = [f for f in figures(cases) if f.section == section and f.label == label]
+    return found
+
+
+SINGLE = answer("single", concealed())
+
+
+@pytest.mark.parametrize(
+    ("said", "outcome"),
+    [
+        (report(named()), "right"),
+        (report(named("rolling_resistance", ambiguous_with=["drive_coulomb_friction"])), "in a look-alike set"),
+        (report(named(target="rear_left", ambiguous_with=["drive_coulomb_friction/front_left"])), "in a look-alike set"),
+        (report(named("rolling_resistance", "rear_left", ambiguous_with=["drive_coulomb_friction"])), "wrong name"),
+        (report(named(), named("payload_mass", "chassis")), "right beside others"),
+        (report(named(target="rear_left")), "wrong name"),
+        (report(unknown=(leftover("time"),)), "unknown only"),
+        (report(), "nothing named"),
+        (None, "no report"),
+    ],
+)
+def test_outcomes_of_a_single(said: dict[str, Any] | None, outcome: str) -> None:
+    assert judged(SINGLE, said).outcome == outcome
+    assert missed(judged(SINGLE, said)) == (outcome not in ("right", "in a look-alike set"))
+
+
+def test_a_pair_is_right_only_as_a_whole() -> None:
+    pair = answer("pair", concealed(), concealed("payload_mass", "chassis", parameters={"mass": 9.0}))
+    assert judged(pair, report(named("payload_mass", "chassis"), named())).outcome == "right"
+    assert judged(pair, report(named())).outcome == "wrong name"
+    alike = named("torque_constant_error", "front_left", ambiguous_with=["payload_mass"])
+    assert judged(pair, report(alike, named())).outcome == "in a look-alike set"
+
+
+def test_one_effect_told_caster_by_caster_is_one_effect() -> None:
+    both = answer("single", concealed(target="front_left+front_right"))
+    parts = report(named(), named(target="front_right"))
+    assert judged(both, parts).outcome == "right"
+    assert judged(both, report(named())).outcome == "wrong name"
+    assert judged(both, parts).parameter_errors() == []
+
+
+def test_statistics_by_known_numbers() -> None:
+    """Wilson against an independent implementation; the others counted by hand."""
+    for count, total in ((0, 150), (1, 150), (75, 150), (120, 120), (1, 3)):
+        other = stats.binomtest(count, total).proportion_ci(method="wilson")
+        assert wilson(count, total) == pytest.approx((other.low, other.high), abs=1e-6)
+    assert calibration_error([0.95] * 20, [True] * 19 + [False]) == pytest.approx(0.0)
+    assert calibration_error([0.95] * 10 + [0.55] * 10, [True] * 5 + [False] * 5 + [True] * 10) == pytest.approx(0.45)
+    assert np.isnan(calibration_error([], []))
+    assert overlap((0.0, 2.0), (1.0, 3.0)) == pytest.approx(1.0 / 3.0)
+    assert overlap((0.0, 1.0), (2.0, 3.0)) == 0.0
+
+
+def test_names_are_counted_above_the_floor() -> None:
+    faint = answer("single", concealed(size=1.0))
+    cases = [judged(SINGLE, report(named()))] * 3 + [judged(SINGLE, report()), judged(faint, report())]
+    found = figure(cases, 1, "outright right")
+    assert (found.value, found.of, found.met) == (0.75, "3 of 4 singles above the floor", False)
+    assert found.interval == wilson(3, 4)
+    assert figure(cases, 1, "right or in set, below the floor").of == "0 of 1 singles and pairs below it"
+
+
+def test_false_alarms_and_harm_on_healthy_cases() -> None:
+    healthy = answer("none")
+    worse = report(fit={"holdout": {"inverse_nrmse": [0.1, 0.1], "rollout": {"v_x": [0.2, 0.21]}, "gap_closed": 0.0}})
+    unchanged = report(fit={"holdout": {"inverse_nrmse": [0.1, 0.1], "rollout": {"v_x": [0.2, 0.2]}, "gap_closed": 0.0}})
+    cases = [judged(healthy, unchanged), judged(healthy, worse), judged(healthy, report(named())), judged(healthy, None)]
+    assert figure(cases, 2, "false alarm: an effect named").of == "1 of 3 healthy cases"
+    assert figure(cases, 6, "harm above 1 %").of == "1 of 3 healthy cases"
+    assert figure(cases, 6, "largest harm").value == pytest.approx(0.05)
+
+
+def test_outside_the_library() -> None:
+    outside = answer("outside", concealed("heading_friction", "rear_left", outside=True, parameters={"size": 0.3}))
+    good = report(unknown=(leftover("speed", 0.2), leftover("steer_angle/rear_left", 0.6)))
+    cases = [
+        judged(outside, good),
+        judged(outside, report(unknown=(leftover("time"),))),
+        judged(outside, report(named(probability=0.9))),
+        judged(outside, report(named(probability=0.5), unknown=(leftover("steer_angle/front_left"),))),
+    ]
+    assert figure(cases, 3, "said so").value == 0.75
+    assert figure(cases, 3, "leading variable right").of == "2 of 3 of those that say so"
+    assert figure(cases, 3, "a name with more than 0.8").value == 0.25
+    assert [missed(j) for j in cases] == [False, True, True, True]
+
+
+def test_location() -> None:
+    push = concealed("external_push", "chassis", parameters={"force_x": 9.0}, onset=4.05, region={"speed": [0.1, 0.3]})
+    patch = concealed("low_friction_patch", target="front_left+rear_left", parameters={"factor": 0.3, "x": 1.0, "y": 0.0},
+                      place={"x": 1.0, "y": 0.0, "radius": 0.3})  # fmt: skip
+    seen = report(named("low_friction_patch", "front_left+rear_left"))
+    seen["locations"][0]["place_m"] = {"x": 1.03, "y": 0.04, "radius": 0.2}
+    cases = [
+        judged(answer("single", push), report(named("external_push", "chassis"))),
+        judged(answer("single", patch), seen),
+        judged(SINGLE, report(named("rolling_resistance"))),
+        judged(SINGLE, report(named(target="rear_left"))),
+    ]
+    assert figure(cases, 4, "onset, median error").value == pytest.approx(0.05)
+    assert figure(cases, 4, "patch centre, median error").value == pytest.approx(0.05)
+    assert figure(cases, 4, "casters").of == "1 of 2 cases with a location, above the floor"
+    assert figure(cases, 4, "region, median overlap").value == pytest.approx(0.75)  # 2/3, 3/4, 3/4
+
+
+def test_numbers_and_their_intervals() -> None:
+    slope = concealed("ground_slope", "chassis", parameters={"angle": 0.02, "direction": 3.1})
+    said = named("ground_slope", "chassis", parameters={
+        "angle": {"value": 0.021, "unit": "rad", "ci95": [0.0205, 0.0215]},
+        "direction": {"value": -3.1, "unit": "rad", "ci95": [-3.3, -2.9]},
+    })  # fmt: skip
+    errors = judged(answer("single", slope), report(said)).parameter_errors()
+    assert [(e.parameter, e.covered) for e in errors] == [("angle", False), ("direction", True)]
+    assert [e.error for e in errors] == pytest.approx([0.05, (2 * np.pi - 6.2) / np.pi])
+    arm = concealed("imu_lever_arm", "imu", parameters={"x": 0.04, "y": 0.03})
+    said = named("imu_lever_arm", "imu", parameters={
+        "x": {"value": 0.045, "unit": "m", "ci95": [0.03, 0.06]}, "y": {"value": 0.03, "unit": "m", "ci95": [0.02, 0.04]},
+    })  # fmt: skip
+    assert [e.error for e in judged(answer("single", arm), report(said)).parameter_errors()] == pytest.approx([0.1, 0.0])
+
+
+def test_rollout_gap_is_towards_what_the_truth_reaches() -> None:
+    told = dataclasses.replace(judged(SINGLE, report(named())), rollout_floor={"v_x": 0.15})
+    assert told.rollout_gap() == pytest.approx(0.8)  # (0.4 - 0.2) / (0.4 - 0.15)
+    assert dataclasses.replace(told, rollout_floor={"v_x": 0.399}).rollout_gap() is None
+    assert figure([told], 6, "gap closed, channels, median").value == 0.98
+
+
+def challenge(folder: Path, cases: list[tuple[dict[str, Any], dict[str, Any] | None]]) -> Path:
+    """Write a challenge whose reports are there already; returns the answer file."""
+    answers = [{**a, "case": f"case_{k:04d}"} for k, (a, _) in enumerate(cases, 1)]
+    sealed = folder.with_name("sealed.json")
+    seal(sealed, {"seed": 5, "count": len(cases), "options": {}}, answers, folder)
+    for own, (_, said) in zip(answers, cases, strict=True):
+        if said is not None:
+            (folder / "reports" / own["case"]).mkdir(parents=True)
+            (folder / "reports" / own["case"] / "report.json").write_text(json.dumps(said))
+    sealed.with_name("sealed.json.floors").write_text(json.dumps({a["case"]: {} for a in answers}))
+    return sealed
+
+
+def test_the_page_has_every_figure_and_every_miss(tmp_path: Path) -> None:
+    wrong = report(named("rolling_resistance", "rear_left"))
+    cases = [(SINGLE, report(named())), (SINGLE, wrong), (answer("none"), report()), (SINGLE, None)]
+    sealed = challenge(tmp_path / "ch", cases)
+    found = score(tmp_path / "ch", sealed, None, lambda message: None)
+    written, printed = page(found), text(found)
+    assert found.digest in written and "seed 5" in printed
+    [misses] = [table for table in found.tables if table.title.startswith("Misses")]
+    assert [row[0] for row in misses.rows] == ["case_0002", "case_0004"]
+    row = next(line for line in written.splitlines() if line.startswith("| case_0002"))
+    assert "drive_coulomb_friction of front_left (coulomb 0.5; 9.0 floors)" in row
+    assert "rolling_resistance of rear_left (0.99)" in row
+    assert "33.3 %" in written  # one of three singles
+    for f in found.figures:
+        assert f.label in written and f.label in printed
+    [confusion] = [table for table in found.tables if table.title == "Concealed and named"]
+    assert confusion.rows[0] == ("drive_coulomb_friction", "2", "0", "1", "0", "rolling_resistance 1")
+
+
+def test_answers_that_are_not_those_sealed_are_refused(tmp_path: Path) -> None:
+    sealed = challenge(tmp_path / "ch", [(SINGLE, report())])
+    sealed.write_text(sealed.read_text().replace("drive_coulomb_friction", "rolling_resistance"))
+    with pytest.raises(MismatchError, match="SHA-256"):
+        score(tmp_path / "ch", sealed, None, lambda message: None)
+    (tmp_path / "ch" / HASH_FILE).unlink()
+    with pytest.raises(MismatchError, match=HASH_FILE):
+        score(tmp_path / "ch", sealed, None, lambda message: None)
+
+
+def test_baselines_on_the_same_cases() -> None:
+    said = {"name": "other", "named": ["drive_coulomb_friction", "x"], "inverse_nrmse": [0.4, 0.2], "seconds": 2.0}
+    own = dataclasses.replace(judged(SINGLE, report()), baselines=[said])
+    healthy = dataclasses.replace(judged(answer("none"), report()), baselines=[said, {"name": "third", "error": "no data"}])
+    from pcw_sim_bridge.mismatch.challenge.score import tables
+
+    [table] = [t for t in tables([own, healthy]) if t.title.startswith("Baselines")]
+    assert table.rows == (
+        ("other", "2 of 2", "1 of 1", "1 of 1", "0.50", "2.0 s"), ("third", "0 of 1", "", "", "", ""),
+    )  # fmt: skip
