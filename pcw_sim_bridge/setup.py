@@ -47,6 +47,7 @@ setup(
             "bridge = pcw_sim_bridge.nodes.bridge:main",
             "markers = pcw_sim_bridge.nodes.markers:main",
             "mismatch = pcw_sim_bridge.mismatch.__main__:main",
+            "mismatch_monitor = pcw_sim_bridge.nodes.mismatch_monitor:main",
             "recorder = pcw_sim_bridge.nodes.recorder:main",
             "simulate = pcw_sim_bridge.simulate:main",
         ],

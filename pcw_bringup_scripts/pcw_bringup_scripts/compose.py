@@ -19,6 +19,7 @@ NODES = {
     "computed_torque": ("pcw_control.nodes.computed_torque", "ComputedTorqueNode"),
     "encoder_slip": ("pcw_estimation.nodes.encoder_slip", "EncoderSlipNode"),
     "markers": ("pcw_sim_bridge.nodes.markers", "MarkersNode"),
+    "mismatch_monitor": ("pcw_sim_bridge.nodes.mismatch_monitor", "MismatchMonitorNode"),
     "odometry": ("pcw_estimation.nodes.odometry", "OdometryNode"),
     "recorder": ("pcw_sim_bridge.nodes.recorder", "RecorderNode"),
     "robot_description": ("pcw_description.nodes.robot_description", "RobotDescriptionNode"),

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -43,7 +43,7 @@ import numpy as np
 from .cdr_columns import CdrColumns, decode_columns
 from .errors import RecordingError, nearest_name
 from .recording_checks import DEGREE, order_stamps, position_scale, units_of
-from .recording_files import RawMessage, RecordingFiles, RecordingWarning, WarningLog
+from .recording_files import MessagesInMemory, RawMessage, RecordingFiles, RecordingWarning, WarningLog
 from .recording_joints import read_joint_series
 from .recording_series import ImuSeries, JointSeries, JointTrace, OdometrySeries, TwistSeries, WrenchSeries
 from .recording_table import FloatArray, IntArray, MessageTable, RowArray
@@ -99,11 +99,17 @@ class _RawTopic:
 class Recording:
     """A recording, opened with `Recording.open`. Series are decoded when first asked for."""
 
-    def __init__(self, path: Path, robot: RobotDescription | None, topics: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        robot: RobotDescription | None,
+        topics: Mapping[str, str],
+        messages: Sequence[RawMessage] | None = None,
+    ) -> None:
         self.path = path
         self.robot = robot
         self._log = WarningLog()
-        self._files = RecordingFiles(path, self._log)
+        self._files = RecordingFiles(path, self._log) if messages is None else MessagesInMemory(messages)
         self._raw: dict[str, _RawTopic] = {}
         self.topics: dict[str, TopicInfo] = {}
         try:
@@ -133,6 +139,24 @@ class Recording:
         """
         recording = cls(Path(path), robot, topics or {})
         _ = recording.joint_states  # nothing can be said without them, so fail here
+        return recording
+
+    @classmethod
+    def of_messages(
+        cls, messages: Sequence[RawMessage], robot: RobotDescription | None = None, name: str = "live"
+    ) -> Recording:
+        """Read messages that are in memory, in the order they came, as if they had been recorded.
+
+        Args:
+            messages: at least those of joint_states.
+            robot: as in `open`.
+            name: stands for the path in errors.
+
+        Raises:
+            RecordingError: as in `open`.
+        """
+        recording = cls(Path(name), robot, {}, messages)
+        _ = recording.joint_states
         return recording
 
     # --- What is there ----------------------------------------------------------------------------------

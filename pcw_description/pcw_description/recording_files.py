@@ -14,7 +14,7 @@ import sqlite3
 import struct
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -80,6 +80,27 @@ class RawMessage(NamedTuple):
     type_name: str
     log_time_ns: int
     cdr: bytes | memoryview
+
+
+class MessagesInMemory:
+    """Messages that are in memory, where `RecordingFiles` has those of files."""
+
+    metadata: dict[str, Any] | None = None
+
+    def __init__(self, messages: Sequence[RawMessage]) -> None:
+        self._messages = messages
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the messages, one after the other."""
+        digest = hashlib.sha256()
+        for message in self._messages:
+            digest.update(message.cdr)
+        return digest.hexdigest()
+
+    def messages(self) -> Iterator[RawMessage]:
+        """All messages in their order."""
+        return iter(self._messages)
 
 
 class RecordingFiles:

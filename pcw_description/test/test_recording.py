@@ -181,6 +181,28 @@ def test_what_is_written_is_read_back_in_the_order_of_the_robot(robot: RobotDesc
     assert recording.topics["/imu/data"].count == len(healthy.stamp_ns[::2])
 
 
+def test_messages_in_memory_are_read_like_a_file(robot: RobotDescription, tmp_path: Path) -> None:
+    written = drive(robot)
+    written.gyro = written.gyro * DEGREES
+    path = tmp_path / "bag"
+    written.write(path)
+    from_file = Recording.open(path, robot)
+    messages = list(from_file.messages())
+    in_memory = Recording.of_messages(messages, robot, "the robot")
+    assert in_memory.topic_names == from_file.topic_names and in_memory.t0_ns == from_file.t0_ns
+    for field in ("stamp_ns", "position", "velocity", "effort"):
+        np.testing.assert_array_equal(getattr(in_memory.joint_states, field), getattr(from_file.joint_states, field))
+    assert in_memory.imu is not None and from_file.imu is not None
+    np.testing.assert_array_equal(in_memory.imu.gyro, from_file.imu.gyro)
+    assert codes(in_memory) == codes(from_file) == ["wrong_unit"]
+    assert list(in_memory.messages()) == messages and len(in_memory.sha256) == 64
+    assert in_memory.sha256 != Recording.of_messages(messages[:-1], robot).sha256
+    with pytest.raises(RecordingError, match="the robot has no joint_states"):
+        Recording.of_messages([m for m in messages if "joint" not in m.topic], robot, "the robot")
+    with pytest.raises(RecordingError, match="holds no messages"):
+        Recording.of_messages([], robot)
+
+
 def test_yaw_is_unwrapped(robot: RobotDescription, tmp_path: Path) -> None:
     spinning = drive(robot)
     spinning.pose[:, 2] = np.linspace(0.0, 20.0, len(spinning.pose))

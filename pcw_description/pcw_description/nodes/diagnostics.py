@@ -50,27 +50,32 @@ class Diagnostics:
         node: the node; its name and `aspect` name the status.
         hardware_id: what the status is about, such as the robot's name.
         status: asked for the status each time.
+        parts: asked for the statuses of parts, by what follows the node's name; they go out in the same message.
         period: wall time between two reports [s]; wall time, because a status matters most when /clock has stopped.
     """
 
     def __init__(
-        self, node: Node, hardware_id: str, status: Callable[[], Status], aspect: str = "status", period: float = 1.0
-    ) -> None:
-        self._node, self._status = node, status
+        self, node: Node, hardware_id: str, status: Callable[[], Status], aspect: str = "status", period: float = 1.0,
+        parts: Callable[[], Mapping[str, Status]] | None = None,
+    ) -> None:  # fmt: skip
+        self._node, self._status, self._parts = node, status, parts
         self._name, self._hardware_id = f"{node.get_name()}: {aspect}", hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(period, self.report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def report(self) -> None:
         """Publish the status now."""
-        status = self._status()
+        statuses = {self._name: self._status()}
+        for name, part in (self._parts() if self._parts is not None else {}).items():
+            statuses[f"{self._node.get_name()}: {name}"] = part
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [
             DiagnosticStatus(
-                level=status.level, name=self._name, message=status.message, hardware_id=self._hardware_id,
+                level=status.level, name=name, message=status.message, hardware_id=self._hardware_id,
                 values=[KeyValue(key=key, value=_text(value)) for key, value in status.values.items()],
             )
+            for name, status in statuses.items()
         ]
         self._publisher.publish(message)
 

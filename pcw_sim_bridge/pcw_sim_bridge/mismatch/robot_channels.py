@@ -106,8 +106,12 @@ class RobotProblemBuilder:
 
     # -- the problem --------------------------------------------------------------------------------------------
 
-    def build(self) -> RegressionProblem:
-        """Return the regression problem of all recordings."""
+    def build(self, with_terms: bool = True) -> RegressionProblem:
+        """Return the regression problem of all recordings.
+
+        Args:
+            with_terms: False leaves out candidate effects and variables: residual and tolerances alone are many times cheaper.
+        """
         sides = self._nominal = [self.model.sides(motion) for motion in self.motions]
         measured = self._filtered([np.nan_to_num(side[0]) for side in sides])
         predicted = self._filtered([side[1] for side in sides])
@@ -126,8 +130,8 @@ class RobotProblemBuilder:
             residual=residual,
             valid=valid,
             nuisances=tuple(self._nuisances(sides)),
-            terms=tuple(self._terms(measured)),
-            variables=self._variables(),
+            terms=tuple(self._terms(measured)) if with_terms else (),
+            variables=self._variables() if with_terms else {},
             scale_deviation=self._scale_deviation(),
         )
 

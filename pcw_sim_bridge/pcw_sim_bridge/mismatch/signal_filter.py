@@ -8,6 +8,7 @@ at which little more than the pass band is left.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from scipy import interpolate, signal
@@ -52,7 +53,7 @@ class SignalFilter:
         """Low-pass along the first axis, same rate; (T, ...) -> (T, ...)."""
         if self.cutoff >= 0.45 * self.rate:
             return np.asarray(values, dtype=float)
-        sos = signal.butter(FILTER_ORDER, self.cutoff, fs=self.rate, output="sos")
+        sos = _low_pass(self.cutoff, self.rate)
         padding = min(len(values) - 1, 3 * self.settling)
         smoothed: FloatArray = signal.sosfiltfilt(sos, values, axis=0, padlen=padding)
         return smoothed
@@ -71,6 +72,13 @@ class SignalFilter:
         edge = np.tan(np.pi * min(self.cutoff, 0.499 * self.rate) / self.rate)
         gain: FloatArray = 1.0 / (1.0 + (warped / edge) ** (2 * FILTER_ORDER))
         return gain
+
+
+@functools.lru_cache(maxsize=64)
+def _low_pass(cutoff: float, rate: float) -> FloatArray:
+    """Second-order sections, not to be changed; designing them takes longer than filtering a second with them."""
+    sections: FloatArray = signal.butter(FILTER_ORDER, cutoff, fs=rate, output="sos")
+    return sections
 
 
 def derivative(values: FloatArray, rate: float) -> FloatArray:
