@@ -230,7 +230,7 @@ def test_no_file_names_a_path_of_one_machine():
     assert offenders == []
 
 
-@pytest.mark.parametrize("name", ["bootstrap", "runtime", "test"])
+@pytest.mark.parametrize("name", ["bootstrap", "runtime", "test", "baselines"])
 def test_every_requirement_is_pinned_and_hashed(name):
     folder = REPOSITORY / "pcw_bringup_scripts/requirements"
     lock = (folder / f"{name}.txt").read_text(encoding="utf-8")

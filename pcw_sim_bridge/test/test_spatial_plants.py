@@ -202,7 +202,7 @@ def test_what_was_set_is_the_state(engine: str, lifted: bool) -> None:
 def test_mujoco_has_the_masses_and_the_rotors_of_the_description(name: str) -> None:
     """Mass matrix in another pose: all masses, and on each caster's joints N^T J N more than without rotors."""
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo, which is optional, is not installed")
-    from pcw_sim_bridge.plants.mujoco_plant import mujoco_model
+    from pcw_sim_bridge.plants.mujoco_plant import mujoco_spec
 
     robot = load_robot(name)
     bare = dataclasses.replace(
@@ -210,7 +210,7 @@ def test_mujoco_has_the_masses_and_the_rotors_of_the_description(name: str) -> N
     )
     matrices = []
     for described in (robot, bare):
-        model = mujoco_model(described, held=False)
+        model = mujoco_spec(described, held=False).compile()
         data = mujoco.MjData(model)
         data.qpos[7:] = np.linspace(-1.0, 2.0, 2 * robot.n)
         mujoco.mj_forward(model, data)

@@ -30,7 +30,7 @@ class MujocoPlant(SpatialPlant):
         super().__init__(MujocoEngine, robot, dt, gui, lifted)
 
 
-def mujoco_model(robot: RobotDescription, held: bool) -> mujoco.MjModel:
+def mujoco_spec(robot: RobotDescription, held: bool) -> mujoco.MjSpec:
     """Return the bodies and rotors of a robot, its base free or, if held, placed by `mocap_pos` and `mocap_quat`.
 
     Raises:
@@ -50,7 +50,7 @@ def mujoco_model(robot: RobotDescription, held: bool) -> mujoco.MjModel:
                 tendon = spec.add_tendon(name=f"{caster.name}_rotor_{axis}", armature=rotor)
                 tendon.wrap_joint(f"{caster.name}_drive", gear[axis, DRIVE])
                 tendon.wrap_joint(f"{caster.name}_steer", gear[axis, STEER])
-    return spec.compile()
+    return spec
 
 
 class MujocoEngine:
@@ -71,7 +71,7 @@ class MujocoEngine:
         self.body_rotors = np.zeros((robot.n, 2, 2))
         self._held = held
         self._com_in_base = np.array(robot.chassis.com)
-        self._model = mujoco_model(robot, held)
+        self._model = mujoco_spec(robot, held).compile()
         option = self._model.opt
         option.gravity[:] = gravity
         option.timestep = dt
