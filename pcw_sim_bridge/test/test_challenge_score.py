@@ -60,7 +60,8 @@ def report(*effects: dict[str, Any], unknown: tuple[dict[str, Any], ...] = (), *
          "place_m": None}
         for e in effects
     ]  # fmt: skip
-    proof = {"source": "", "inverse_nrmse": [0.5, 0.1], "rollout": {"v_x": [0.4, 0.2]}, "gap_closed": 0.98}
+    proof = {"source": "", "inverse_nrmse": [0.5, 0.1], "rollout": {"v_x": [0.4, 0.2]}, "gap_closed": 0.98,
+             "rollout_gap_closed": 0.9, "harm": 0.0}
     return {
         "verdict": "explained" if effects else "no_mismatch", "effects": list(effects), "locations": places,
         "unknown": list(unknown), "fit": {"holdout": proof}, **changes,
@@ -141,8 +142,8 @@ def test_names_are_counted_above_the_floor() -> None:
 
 def test_false_alarms_and_harm_on_healthy_cases() -> None:
     healthy = answer("none")
-    worse = report(fit={"holdout": {"inverse_nrmse": [0.1, 0.1], "rollout": {"v_x": [0.2, 0.21]}, "gap_closed": 0.0}})
-    unchanged = report(fit={"holdout": {"inverse_nrmse": [0.1, 0.1], "rollout": {"v_x": [0.2, 0.2]}, "gap_closed": 0.0}})
+    worse = report(fit={"holdout": {"inverse_nrmse": [0.1, 0.1], "rollout": {}, "gap_closed": 0.0, "harm": 0.05}})
+    unchanged = report(fit={"holdout": {"inverse_nrmse": [0.1, 0.1], "rollout": {}, "gap_closed": 0.0, "harm": 0.0}})
     cases = [judged(healthy, unchanged), judged(healthy, worse), judged(healthy, report(named())), judged(healthy, None)]
     assert figure(cases, 2, "false alarm: an effect named").of == "1 of 3 healthy cases"
     assert figure(cases, 6, "harm above 1 %").of == "1 of 3 healthy cases"
@@ -198,10 +199,10 @@ def test_numbers_and_their_intervals() -> None:
     assert [e.error for e in judged(answer("single", arm), report(said)).parameter_errors()] == pytest.approx([0.1, 0.0])
 
 
-def test_rollout_gap_is_towards_what_the_truth_reaches() -> None:
-    told = dataclasses.replace(judged(SINGLE, report(named())), rollout_floor={"v_x": 0.15})
-    assert told.rollout_gap() == pytest.approx(0.8)  # (0.4 - 0.2) / (0.4 - 0.15)
-    assert dataclasses.replace(told, rollout_floor={"v_x": 0.399}).rollout_gap() is None
+def test_the_gap_of_the_simulation_and_the_harm_are_those_of_the_report() -> None:
+    told = judged(SINGLE, report(named()))
+    assert told.rollout_gap() == 0.9
+    assert told.harm() == 0.0
     assert figure([told], 6, "gap closed, channels, median").value == 0.98
 
 
@@ -214,7 +215,6 @@ def challenge(folder: Path, cases: list[tuple[dict[str, Any], dict[str, Any] | N
         if said is not None:
             (folder / "reports" / own["case"]).mkdir(parents=True)
             (folder / "reports" / own["case"] / "report.json").write_text(json.dumps(said))
-    sealed.with_name("sealed.json.floors").write_text(json.dumps({a["case"]: {} for a in answers}))
     return sealed
 
 

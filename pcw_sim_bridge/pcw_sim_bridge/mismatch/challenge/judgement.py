@@ -59,14 +59,12 @@ class Judgement:
         report: what the analyser said; None where there is no report.
         usage: `seconds`, `cpu_seconds`, `peak_bytes` of the analysis.
         baselines: what others said.
-        rollout_floor: see `rollout_floors`; None where there is none.
     """
 
     answer: Answer
     report: Mapping[str, Any] | None
     usage: Mapping[str, float]
     baselines: Sequence[Mapping[str, Any]] = ()
-    rollout_floor: Mapping[str, float] | None = None
 
     @property
     def kind(self) -> str:
@@ -184,24 +182,15 @@ class Judgement:
         return None if proof is None else float(proof["gap_closed"])
 
     def rollout_gap(self) -> float | None:
-        """The same of the held-out rollout, towards what the concealed truth reaches; None: it is not to be seen there."""
+        """The same of the held-out forward simulation; None where nothing could be simulated."""
         proof = self._proof()
-        if proof is None or not self.rollout_floor:
-            return None
-        signals = [name for name in proof["rollout"] if name in self.rollout_floor]
-        if not signals:
-            return None
-        before, after = (_norm(proof["rollout"][name][k] for name in signals) for k in (0, 1))
-        floor = _norm(self.rollout_floor[name] for name in signals)
-        return min((before - after) / (before - floor), 1.0) if before > 1.02 * floor else None
+        closed = None if proof is None else proof.get("rollout_gap_closed")
+        return None if closed is None else float(closed)
 
     def harm(self) -> float | None:
-        """Largest relative increase of a held-out error by the patch; 0 if none grew."""
+        """Largest relative increase, beyond chance, of a held-out error by the patch; 0 if none grew."""
         proof = self._proof()
-        if proof is None:
-            return None
-        pairs = [proof["inverse_nrmse"], *proof["rollout"].values()]
-        return max(0.0, *(after / before - 1.0 for before, after in pairs if before > 0.0), 0.0)
+        return None if proof is None else float(proof["harm"])
 
     def _proof(self) -> Mapping[str, Any] | None:
         return self.report["fit"].get("holdout") if self.report is not None else None

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,19 +103,25 @@ def analyse_case(case: Path, out: Path, baselines: bool) -> str:
 def _run_baselines(case: Path, out: Path) -> None:
     fit, holdout = recordings_of(case)
     begun = time.monotonic()
-    found = _baseline_function()(load_robot(case / "robot.yaml"), fit, holdout)
+    results = _baseline_function()(load_robot(case / "robot.yaml"), fit, holdout, _noise_floors(out))
+    found = [{**dataclasses.asdict(r), "named": list(r.names), "error": r.remark} for r in results]
     part = out / f"{BASELINES}.part"
     part.write_text(json.dumps({"baselines": found, "seconds": time.monotonic() - begun}, indent=1), encoding="utf-8")
     os.replace(part, out / BASELINES)
 
 
-def _baseline_function() -> Callable[..., list[dict[str, Any]]]:
+def _noise_floors(out: Path) -> dict[str, float]:
+    """Noise of the channels by the analyser's report, to which others are held too."""
+    report = json.loads((out / REPORT).read_text(encoding="utf-8"))
+    return {channel["name"]: channel["noise_floor"] for channel in report["channels"]}
+
+
+def _baseline_function() -> Callable[..., Sequence[Any]]:
     try:
         from ..baselines import run_baselines
     except ImportError as error:
         raise MismatchError(f"--baselines: not in this installation ({error}); allowed: without --baselines") from None
-    found: Callable[..., list[dict[str, Any]]] = run_baselines
-    return found
+    return run_baselines
 
 
 def _is_done(report: Path, baselines: bool) -> bool:

@@ -13,15 +13,12 @@ from typing import Any
 import numpy as np
 
 from pcw_description.effects.registry import all_effects
-from pcw_description.robot_file import parse_robot
 
 from ..errors import MismatchError
-from ..robot_subject import RobotSubject
-from .cases import LEAST_EVIDENCE, Answer, effects_of
+from .cases import LEAST_EVIDENCE, Answer
 from .judgement import OUTCOMES, Judgement, ParameterError
 from .run import BASELINES, REPORT, USAGE
-from .sealed_answers import open_sealed, write_whole
-from .worker_processes import run_tasks
+from .sealed_answers import open_sealed
 
 Progress = Callable[[str], None]
 CONFIDENT = 0.8
@@ -84,8 +81,8 @@ def score(folder: Path, answers: Path, reports: Path | None, progress: Progress)
     reported = [a for a in cases if (reports / a["case"] / REPORT).exists()]
     if not reported:
         raise MismatchError(f"{reports} holds no report of these cases; allowed: after `challenge run`")
-    floors = rollout_floors(folder, reported, answers.with_name(answers.name + ".floors"), progress)
-    judged = [_judgement(a, reports / a["case"], floors.get(a["case"])) for a in cases]
+    progress(f"{len(reported)} of {len(cases)} cases have a report")
+    judged = [_judgement(a, reports / a["case"]) for a in cases]
     return Score(
         seed=sealed["seed"],
         digest=(folder / "answers.sha256").read_text(encoding="ascii").split()[0],
@@ -95,42 +92,12 @@ def score(folder: Path, answers: Path, reports: Path | None, progress: Progress)
     )
 
 
-def _judgement(answer: Answer, folder: Path, floor: Mapping[str, float] | None) -> Judgement:
+def _judgement(answer: Answer, folder: Path) -> Judgement:
     def read(name: str) -> Any:
         path = folder / name
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
-    return Judgement(answer, read(REPORT), read(USAGE) or {}, (read(BASELINES) or {}).get("baselines", ()), floor)
-
-
-def rollout_floors(
-    folder: Path, cases: Sequence[Answer], kept: Path, progress: Progress
-) -> Mapping[str, Mapping[str, float]]:
-    """Return the held-out rollout error of the description patched with the concealed truth, by case.
-
-    That is what a right patch reaches. It takes a few seconds a case, and is kept in the file `kept`.
-    """
-    found: dict[str, Mapping[str, float]] = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
-    wanted = [
-        a for a in cases
-        if a["effects"] and not any(e["outside"] for e in a["effects"]) and a["case"] not in found
-    ]
-    for number, done in enumerate(run_tasks(rollout_floor, [(a["case"], (folder, a)) for a in wanted], 2), 1):
-        progress(f"rollout floor of {done.name} {done.error or ''} ({number} of {len(wanted)})")
-        found[done.name] = done.result or {}
-    if wanted:
-        write_whole(kept, json.dumps(found, indent=1, sort_keys=True).encode())
-    return found
-
-
-def rollout_floor(folder: Path, answer: Answer) -> dict[str, float]:
-    """Return the error per signal of one case."""
-    nominal = parse_robot(answer["nominal"])
-    holdout = [run for run in answer["runs"] if run["path"].startswith("holdout")]
-    effects = effects_of(answer) if all(run["active"] for run in holdout) else []
-    subject = RobotSubject(dataclasses.replace(nominal, physics=(*nominal.physics, *effects)))
-    opened = [subject.open(folder / answer["case"] / run["path"], "holdout", {}) for run in holdout]
-    return {name: value for name, value in subject.rollout(opened).items() if math.isfinite(value)}
+    return Judgement(answer, read(REPORT), read(USAGE) or {}, (read(BASELINES) or {}).get("baselines", ()))
 
 
 # -- statistics ---------------------------------------------------------------------------------------------------
