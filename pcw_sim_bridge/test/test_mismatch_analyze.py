@@ -19,19 +19,7 @@ from pcw_description.recording_writer import RecordingWriter
 from pcw_description.robot_description import DRIVE
 from pcw_sim_bridge.simulated_run import record_run
 
-LINEAR_AXIS = """\
-format: pcw_axis/1
-name: sled
-kind: linear
-provenance: {all: made up for this test}
-columns:
-  time: {column: time, unit: s}
-  position: {column: position, unit: m}
-  force: {column: force, unit: N}
-inertia: 20.0
-tolerances: {inertia: 1 %}
-physics: []
-"""
+LINEAR_AXIS = (Path(__file__).parent / "sled.yaml").read_text(encoding="utf-8")
 
 
 def analyze(*arguments: object) -> subprocess.CompletedProcess[str]:

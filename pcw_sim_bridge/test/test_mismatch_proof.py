@@ -24,19 +24,7 @@ from pcw_sim_bridge.plants.reduced import ReducedPlant, WindowStarts
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
-SLED = """\
-format: pcw_axis/1
-name: sled
-kind: linear
-provenance: {all: made up for this test}
-columns:
-  time: {column: time, unit: s}
-  position: {column: position, unit: m}
-  force: {column: force, unit: N}
-inertia: 20.0
-tolerances: {inertia: 1 %}
-physics: []
-"""
+SLED = (Path(__file__).parent / "sled.yaml").read_text(encoding="utf-8")
 
 
 def physics(name: str, target: str, **values: float) -> EffectInstance:

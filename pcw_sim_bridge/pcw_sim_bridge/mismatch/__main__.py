@@ -34,9 +34,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except PcwError as error:
         print(f"mismatch: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not _interrupted(error):
+            raise
         print(f"mismatch: interrupted; {options.interrupted}", file=sys.stderr)
         return 130
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether an error is Ctrl-C; one that falls into compiled code comes out as a SystemError with Ctrl-C as its cause."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
 
 
 if __name__ == "__main__":

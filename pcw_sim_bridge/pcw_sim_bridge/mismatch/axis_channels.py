@@ -260,6 +260,8 @@ class AxisProblemBuilder:
 
     def _misfit(self, columns: Sequence[FloatArray]) -> float:
         """Least squares of the force that remain beside columns (T, P)."""
+        if not self._valid.any():  # it never moves: nothing is misfitted
+            return 0.0
         stacked = np.concatenate(columns, axis=1)[self._valid]
         scaled = stacked / np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
         force = self._force[self._valid]
@@ -269,7 +271,7 @@ class AxisProblemBuilder:
     def _leading_periodic(self) -> list[tuple[JointTorqueEffect, Shape]]:
         """The strongest effects periodic in position with their shapes, beside the simplest model of a drive."""
         valid = self._valid
-        if not valid.any():
+        if not valid.any():  # it never moves
             return []
         force = self._force[valid]
         columns = [self._filtered(self._smooth_forces)[:, None], np.ones((len(valid), 1))]

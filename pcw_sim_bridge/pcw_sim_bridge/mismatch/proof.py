@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.kinds import ClockEffect, ImuEffect
 from pcw_description.effects.registry import get
 
 from .errors import MismatchError
@@ -69,6 +70,11 @@ def effect_instance(
 def is_event(effect_name: str) -> bool:
     """Whether an effect comes once, from outside, and says nothing of another time."""
     return "start" in {parameter.name for parameter in get(effect_name).parameters}
+
+
+def moves_the_robot(effect_name: str) -> bool:
+    """Whether a simulation can tell for or against an effect: no error of an IMU or of its clock moves a robot."""
+    return not isinstance(get(effect_name), (ImuEffect, ClockEffect))
 
 
 class Prover:
@@ -185,7 +191,9 @@ class Prover:
     ) -> tuple[int, str] | None:
         """Where the simulation follows less well with the patch: the effect without which it follows best."""
         windows = self._quiet_windows(explanation)
-        if windows is None or self.before is None or after is None or not held_out.proposed:
+        terms = explanation.search.problem.terms
+        moving = [k for k in held_out.proposed if moves_the_robot(terms[held_out.instances[k].term].effect)]
+        if windows is None or self.before is None or after is None or not moving:
             return None
 
         def errors(squares: FloatArray) -> PairedErrors:
@@ -195,7 +203,7 @@ class Prover:
         if errors(after).worse()[0] == 0.0:
             return None
         follows = []
-        for index in held_out.proposed:
+        for index in moving:
             squares = self._rollout(explanation, held_out, index)
             assert squares is not None
             follows.append((float(errors(squares).after[0]), index))

@@ -75,7 +75,7 @@ def run_tasks(
                 name = worker.task
                 try:
                     done = Done(name, *worker.connection.recv())
-                except EOFError:
+                except (EOFError, ConnectionResetError):
                     worker.process.join()
                     done = Done(name, None, f"its process ended with code {worker.process.exitcode}", 0.0, 0)
                     worker.stop()
