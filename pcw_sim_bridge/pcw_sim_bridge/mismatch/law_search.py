@@ -40,6 +40,8 @@ KEPT_PART = 0.02
 # A law that replaces a name must differ from it by this part of what the name does.
 REPLACED_PART = 0.15
 MENDING_PART = 0.05
+# A law of a motor's own torque that takes away more of it than this only says that the joint does not accelerate.
+LARGEST_MOTOR_PART = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,8 +112,25 @@ class LawSearch:
         # All are judged under the noise that the best of them leaves: under that of a worse one it is "slow noise".
         residual = self._left_by(max(trials, key=self._plain_evidence))
         trials = [self._pruned(residual, trial) for trial in trials]
-        best = max(trials, key=lambda t: t.search.whiten_at(residual).fit(t.instances).log_evidence)
-        return self._judged(best)
+        fits = [trial.search.whiten_at(residual).fit(trial.instances) for trial in trials]
+        order = np.argsort([-fit.log_evidence for fit in fits])
+        best = next((trials[k] for k in order if not self._undoes_a_motor(trials[k].law, fits[k])), None)
+        return None if best is None else self._judged(best)
+
+    def _undoes_a_motor(self, law: Law, fit: Fit) -> bool:
+        """Whether a law, the last instance of a fit, takes away most of the motor's torque of which it is a function."""
+        sites = self.problem.sites
+        assert sites is not None
+        torques: FloatArray | None = None
+        for index, site in enumerate(sites.names):
+            motor = "force" if site == "axis_force" else site
+            if site not in law.sites or motor not in law.depends_on:
+                continue
+            torques = law.torques(sites) if torques is None else torques
+            taken = torques[:, index] @ fit.mean[-torques.shape[2] :]
+            if np.sum(taken**2) > LARGEST_MOTOR_PART**2 * np.sum(sites.variables[motor] ** 2):
+                return True
+        return False
 
     # -- screening ----------------------------------------------------------------------------------------------
 
@@ -174,12 +193,19 @@ class LawSearch:
             f"outside the library: {' and '.join(best.law.sites)} by {', '.join(best.law.depends_on)}:"
             f" {gain:.1f} nats, held out {held_out:.1f}"
         )
-        replaced = [i not in best.names for i in self.names]
+        # A name that the recording does without anyway is nothing that a law could stand for.
+        idle = {
+            instance
+            for index, instance in enumerate(self.names)
+            if without.log_evidence - regression.fit((*self.names[:index], *self.names[index + 1 :])).log_evidence
+            < self.threshold - LAW_MARGIN
+        }
+        replaced = [i not in best.names and i not in idle for i in self.names]
         sure = min(gain, held_out) >= self.threshold
         counts = sure and self._matters(problem, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
-        dropped = tuple(i for i in self.names if i not in best.names)
-        names, withdrawn = best.names, dropped
+        dropped = tuple(i for i in self.names if i not in best.names and i not in idle)
+        names, withdrawn = tuple(i for i in self.names if i not in dropped), dropped
         alike = bool(dropped) and (scores[1] - scores[0]) / both < KEPT_PART
         if alike and counts:
             names, withdrawn = self.names, ()
