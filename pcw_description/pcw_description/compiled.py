@@ -90,24 +90,47 @@ def _kernels_digest(folder: str) -> str:
     return digest.hexdigest()
 
 
+def _kernel_type(signature: str) -> Any:
+    arguments, result = numba.core.sigutils.normalize_signature(signature)
+    return numba.types.FunctionType(result(*arguments))
+
+
+if COMPILES:
+    _JOINT_TORQUE, _ARRAY_KERNEL = _kernel_type(JOINT_TORQUE_SIGNATURE), _kernel_type(ARRAY_SIGNATURE)
+
+    # Numba's own list compiles its methods anew in every process; these come from the cache.
+    @compiled
+    def _no_joint_torques():  # type: ignore[no-untyped-def]
+        return numba.typed.List.empty_list(_JOINT_TORQUE)
+
+    @compiled
+    def _no_array_kernels():  # type: ignore[no-untyped-def]
+        return numba.typed.List.empty_list(_ARRAY_KERNEL)
+
+    @compiled
+    def _append(kernels, kernel):  # type: ignore[no-untyped-def]
+        kernels.append(kernel)
+
+    for _type in (_JOINT_TORQUE, _ARRAY_KERNEL):
+        _append.compile(numba.void(numba.types.ListType(_type), _type))  # type: ignore[attr-defined]
+    _append.disable_compile()  # type: ignore[attr-defined]
+
+
 def joint_torque_list(functions: Sequence[Callable[..., tuple[float, float]]]) -> Any:
     """A list of joint-torque kernels that compiled code can call, empty lists included."""
-    return _kernel_list(JOINT_TORQUE_SIGNATURE, functions)
+    return _kernel_list(_no_joint_torques, functions) if COMPILES else list(functions)
 
 
 def array_kernel_list(functions: Sequence[Callable[..., None]]) -> Any:
     """A list of kernels of arrays that compiled code can call, empty lists included."""
-    return _kernel_list(ARRAY_SIGNATURE, functions)
+    return _kernel_list(_no_array_kernels, functions) if COMPILES else list(functions)
 
 
-def _kernel_list(signature: str, functions: Sequence[Callable[..., Any]]) -> Any:
-    if not NUMBA_AVAILABLE:
-        return list(functions)
-    arguments, result = numba.core.sigutils.normalize_signature(signature)
-    typed_list = numba.typed.List.empty_list(numba.types.FunctionType(result(*arguments)))
+def _kernel_list(empty: Callable[[], Any], functions: Sequence[Callable[..., Any]]) -> Any:
+    kernels = empty()
     for function in functions:
-        typed_list.append(function)
-    return typed_list
+        _append(kernels, function)
+    return kernels
 
 
 def compiled_for_kernel(kernel_signature: str, result: str, arguments: str) -> Callable[[Function], Function]:
@@ -121,8 +144,7 @@ def compiled_for_kernel(kernel_signature: str, result: str, arguments: str) -> C
     def decorate(function: Function) -> Function:
         if not COMPILES:
             return function
-        kernel_arguments, kernel_result = numba.core.sigutils.normalize_signature(kernel_signature)
-        kernel = numba.types.FunctionType(kernel_result(*kernel_arguments))
+        kernel = _kernel_type(kernel_signature)
         others, returned = numba.core.sigutils.normalize_signature(f"{result}({arguments})")
         dispatcher: Any = compiled(function)
         dispatcher.compile(returned(kernel, *others))

@@ -15,6 +15,7 @@ its slow part: parameters stay those of a least-squares fit, intervals and evide
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from scipy import sparse
@@ -50,7 +51,8 @@ class NoiseModel:
             if len(block) <= memory:
                 continue
             for channel, taps in enumerate(self.taps):
-                result[piece.start + memory : piece.stop, channel] = _convolution(taps, len(block)) @ block[:, channel]
+                convolution = _convolution(taps.tobytes(), len(block))
+                result[piece.start + memory : piece.stop, channel] = convolution @ block[:, channel]
         return result
 
     def usable(self, valid: BoolArray, segment: IntArray) -> BoolArray:
@@ -86,8 +88,10 @@ class NoiseModel:
         return white
 
 
-def _convolution(taps: FloatArray, count: int) -> sparse.csr_array:
-    """Matrix (count - L + 1, count) that filters with taps (L,) where the whole filter has samples."""
+@functools.lru_cache(maxsize=128)
+def _convolution(content: bytes, count: int) -> sparse.csr_array:
+    """Matrix (count - L + 1, count) that filters with taps (L,), given by content, where the whole filter has samples."""
+    taps = np.frombuffer(content)
     rows = count - len(taps) + 1
     diagonals = np.repeat(taps[::-1][:, None], count, axis=1)
     return sparse.dia_array((diagonals, np.arange(len(taps))), shape=(rows, count)).tocsr()

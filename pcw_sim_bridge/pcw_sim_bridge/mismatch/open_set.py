@@ -267,7 +267,8 @@ class OpenSetTest:
         self.instances = tuple(instances)
         self.residual = search.residual_of(self.instances)
         self.bases = self._bases()
-        self.regression = search.whiten_at(self._unexplained())
+        self.noise = self._unexplained()
+        self.regression = search.whiten_at(self.noise)
 
     def _bases(self) -> dict[tuple[int, str], tuple[FloatArray, FloatArray]]:
         """Basis columns (T, K) and knots by channel and variable."""
@@ -305,9 +306,7 @@ class OpenSetTest:
         vetoed = self._vetoes(leftovers, threshold)
         floor = np.array(
             [
-                robust_deviation(self._unexplained()[self.problem.valid[:, c], c])
-                if self.problem.valid[:, c].any()
-                else 0.0
+                robust_deviation(self.noise[self.problem.valid[:, c], c]) if self.problem.valid[:, c].any() else 0.0
                 for c in range(len(self.problem.channels))
             ]
         )

@@ -247,7 +247,7 @@ class _Drawing:
             return []
         run = self._fit[0]
         healthy = simulate(self._world, run, ())
-        channels = HealthyChannels(self._world.nominal, [healthy])
+        channels = HealthyChannels(self._world.nominal, [healthy], [simulate(self._world.quiet(), run, ())])
         scene = Scene(self._base, healthy, self._rng)
         cancelling = self._order.masking == "cancelling"
         found = []
@@ -290,7 +290,7 @@ class _Drawing:
                 instances = group(factor)
                 if kept is not None and instances == kept[0]:
                     break  # at its limit
-                size = channels.size([simulate(self._world, run, instances)])
+                size = channels.size([simulate(self._world.quiet(), run, instances)])
             except PcwError:  # too much for the robot, or for the effect's own range
                 factor *= 0.3
                 continue

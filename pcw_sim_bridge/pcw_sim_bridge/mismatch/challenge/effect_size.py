@@ -1,4 +1,4 @@
-"""How large an effect is in the channels of the analyser: the same run with the same noise, with it and without.
+"""How large an effect is in the channels of the analyser: the same run, without noise in its sensors, with it and without.
 
     size = max over channels of rms(residual with - residual without) / noise floor
 
@@ -46,7 +46,16 @@ class EffectSize:
 class HealthyChannels:
     """The channels of a case's healthy runs, and their noise floor."""
 
-    def __init__(self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording]) -> None:
+    def __init__(
+        self,
+        nominal: RobotDescription,
+        recordings: Sequence[SimulatedRecording],
+        quiet: Sequence[SimulatedRecording],
+    ) -> None:
+        """Take the healthy runs, and the same without noise in their sensors.
+
+        Two noisy runs that differ in nothing but a small number read other counts of their encoders, and differ by that.
+        """
         self._nominal = nominal
         builder = RobotProblemBuilder(nominal, list(recordings))  # type: ignore[arg-type]
         self._cutoff = builder.cutoff
@@ -54,14 +63,15 @@ class HealthyChannels:
         self._columns = self.problem.nuisance_columns()
         self._deviations = self.problem.nuisance_deviations()
         self.floor = self._noise_floor()
+        self._quiet = _build(nominal, quiet, self._cutoff)
 
     def size(self, recordings: Sequence[SimulatedRecording]) -> EffectSize:
-        """Return how large an effect is that these runs have and the healthy ones have not."""
+        """Return how large an effect is that these runs without noise have and the healthy ones have not."""
         problem = self.problem
         with_effect = _build(self._nominal, recordings, self._cutoff)
-        length = min(len(problem.residual), len(with_effect.residual))
+        length = min(len(problem.residual), len(with_effect.residual), len(self._quiet.residual))
         change = np.zeros_like(problem.residual)
-        change[:length] = with_effect.residual[:length] - problem.residual[:length]
+        change[:length] = with_effect.residual[:length] - self._quiet.residual[:length]
         rows = problem.valid & np.isfinite(change)
         relative = _rms(change, rows) / self.floor
         largest = int(np.argmax(relative))

@@ -19,9 +19,12 @@ from pcw_description.errors import DescriptionError
 from pcw_description.robot_description import AXIS_NAMES, Caster, ContactDescription, RobotDescription
 
 Change = Callable[[RobotDescription, float], RobotDescription]
-# Healthy robots are no further off than this, in standard deviations; a tyre's stiffness cannot vanish.
+# Healthy robots are no further off than this, in standard deviations; a tyre's stiffness and relaxation cannot vanish.
 LARGEST_DEVIATION = 2.5
-LARGEST_STIFFNESS_DEVIATION = 1.4
+LARGEST_TYRE_DEVIATION = 1.4
+# No tyre gives less than this part of what is described, however it is drawn or tuned.
+STIFFEST = 0.2
+RELAXATION = "contact.relaxation_length"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +50,9 @@ def healthy_numbers(robot: RobotDescription) -> tuple[HealthyNumber, ...]:
     for caster in robot.casters:
         found += _caster_numbers(robot, caster)
     if robot.sensors.imu is not None:
-        found += _imu_numbers(robot)
+        found += [*_imu_numbers(robot), _clock(robot, "imu", "offset")]
+    if robot.sensors.tracker is not None:
+        found.append(_clock(robot, "tracker", "tracker_offset"))
     return tuple(found)
 
 
@@ -55,7 +60,7 @@ def draw_deviations(robot: RobotDescription, rng: np.random.Generator) -> dict[s
     """Draw how far a healthy robot is off, by the names of `healthy_numbers`."""
     drawn = {}
     for number in healthy_numbers(robot):
-        widest = LARGEST_STIFFNESS_DEVIATION if number.name == "contact.stiffness" else LARGEST_DEVIATION
+        widest = LARGEST_TYRE_DEVIATION if number.name in ("contact.stiffness", RELAXATION) else LARGEST_DEVIATION
         drawn[number.name] = number.deviation * float(np.clip(rng.standard_normal(), -widest, widest))
     return drawn
 
@@ -138,6 +143,7 @@ def _shared_numbers(robot: RobotDescription) -> list[HealthyNumber]:
         HealthyNumber("chassis.com.y", _tolerance(robot, "chassis.com", 0.0), centre(1)),
         HealthyNumber("contact.mu_p", _tolerance(robot, "contact.mu_p", 1.0), _friction),
         HealthyNumber("contact.stiffness", _tolerance(robot, "contact.stiffness", 1.0), _compliance),
+        HealthyNumber(RELAXATION, _tolerance(robot, RELAXATION, robot.contact.relaxation_length), _relaxation),
         HealthyNumber("ground.slope.x", _tolerance(robot, "ground.slope", 0.0), slope(0.0), described=False),
         HealthyNumber("ground.slope.y", _tolerance(robot, "ground.slope", 0.0), slope(0.5 * math.pi), described=False),
     ]
@@ -182,6 +188,8 @@ def _caster_numbers(robot: RobotDescription, caster: Caster) -> list[HealthyNumb
     for axis in AXIS_NAMES:
         deviation = _tolerance(robot, "torque_constant", 1.0)
         found.append(HealthyNumber(f"torque_constant/{name}_{axis}", deviation, gain(axis), described=False))
+        spread = _tolerance(robot, "contact.stiffness_spread", 1.0)
+        found.append(HealthyNumber(f"contact.stiffness/{name}_{axis}", spread, _compliance_of(name, axis), described=False))
     return found
 
 
@@ -229,9 +237,32 @@ def _friction(robot: RobotDescription, value: float) -> RobotDescription:
 
 def _compliance(robot: RobotDescription, value: float) -> RobotDescription:
     """The slip that a force takes, more by `value` of it."""
+    return robot.with_tyres(robot.caster_names, lambda tyre: _softer(_softer(tyre, "drive", value), "steer", value))
 
+
+def _compliance_of(caster: str, axis: str) -> Change:
+    """The same of one tyre, along its heading ("drive") or across."""
+    return lambda robot, value: robot.with_tyres([caster], lambda tyre: _softer(tyre, axis, value))
+
+
+def _softer(tyre: ContactDescription, axis: str, value: float) -> ContactDescription:
+    factor = max(1.0 + value, STIFFEST)
+    if axis == "drive":
+        return dataclasses.replace(tyre, lambda_p=min(tyre.lambda_p * factor, 1.0))
+    lateral = dataclasses.replace(tyre.lateral, lambda_p=min(tyre.lateral.lambda_p * factor, 1.0))
+    return dataclasses.replace(tyre, lateral=lateral)
+
+
+def _relaxation(robot: RobotDescription, value: float) -> RobotDescription:
     def change(tyre: ContactDescription) -> ContactDescription:
-        lateral = dataclasses.replace(tyre.lateral, lambda_p=min(tyre.lateral.lambda_p * (1.0 + value), 1.0))
-        return dataclasses.replace(tyre, lambda_p=min(tyre.lambda_p * (1.0 + value), 1.0), lateral=lateral)
+        length = tyre.relaxation_length
+        return dataclasses.replace(tyre, relaxation_length=max(length + value, STIFFEST * length))
 
     return robot.with_tyres(robot.caster_names, change)
+
+
+def _clock(robot: RobotDescription, sensor: str, parameter: str) -> HealthyNumber:
+    def late(r: RobotDescription, value: float) -> RobotDescription:
+        return _with_effect(r, "clock_offset", ("clock",), {"offset": 0.0, parameter: value})
+
+    return HealthyNumber(f"clock.offset.{sensor}", _tolerance(robot, "clock.offset", 0.0), late, described=False)

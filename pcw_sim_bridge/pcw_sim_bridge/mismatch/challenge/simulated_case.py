@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from ...simulated_robot import JointCommand, Sample, SimulatedRobot, TrackedPose
 from ...simulated_run import START_NS, drive, record_run
 from ...stamping import StampingParameters, TopicStamps
 from .outside_effects import OUTSIDE_EFFECTS, CrossJointLaw, LawPlant
+
+FINE_COUNTS = 1e8  # [counts/rev], far below every noise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +85,19 @@ class World:
         """Return the true robot with effects at work that a plant knows by their kind."""
         kinds = [e for e in effects if not isinstance(_outside(e), CrossJointLaw)]
         return dataclasses.replace(self.true, physics=(*self.true.physics, *kinds))
+
+    def quiet(self) -> World:
+        """Return the world with sensors that have no noise and encoders that count finely."""
+        sensors = self.true.sensors
+        changed: dict[str, Any] = {}
+        for part in ("encoders", "imu", "tracker"):
+            own = getattr(sensors, part)
+            if own is not None:
+                noises = {f.name: 0.0 for f in dataclasses.fields(own) if f.name.endswith("_noise")}
+                changed[part] = dataclasses.replace(own, **noises)
+        changed["encoders"] = dataclasses.replace(changed["encoders"], drive_counts=FINE_COUNTS, steer_counts=FINE_COUNTS)
+        true = dataclasses.replace(self.true, sensors=dataclasses.replace(sensors, **changed))
+        return dataclasses.replace(self, true=true)
 
     def make(self, robot: RobotDescription, effects: Sequence[EffectInstance]) -> Plant:
         """Make the plant of a robot, with the laws at work that are of no kind."""
