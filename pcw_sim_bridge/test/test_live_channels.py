@@ -70,10 +70,9 @@ def test_a_healthy_robot_stays_near_one_and_a_fault_is_seen_where_it_is(friction
     assert abs(begun - FAULT_TIME) < 0.25
     assert last.suspect is not None and last.suspect.told
     assert (last.suspect.place, last.suspect.cause) == (THESIS.caster_names[0], "friction in the drive")
-    # Torques alone feel it: the IMU's channels do not depart.
-    assert {state.name for state in last.channels if state.level is not Level.OK} <= {
-        "chassis_force/x", "chassis_force/y", "chassis_torque/z",
-    }  # fmt: skip
+    # The torques feel it, and the slip that is foretold from them: not what the IMU and the tracker measure.
+    departed = {state.name.partition("/")[0] for state in last.channels if state.level is not Level.OK}
+    assert "chassis_force" in departed and departed <= {"chassis_force", "chassis_torque", "rolling_consistency"}
 
 
 def test_a_push_is_told_from_casters(learned: Tuning) -> None:
@@ -127,7 +126,8 @@ def test_a_lost_sensor_is_said_and_the_others_go_on(learned: Tuning, friction: l
     live = LiveChannels(THESIS, PARAMETERS, learned)
     sent = [m for m in after(friction, 2.0) if m.log_time_ns < 5e9 or m.topic != "/imu/data"]
     last = [j for now, j, _ in judgements(live, iter(sent)) if now < FAULT_TIME][-1]
-    assert [state.name for state in last.channels] == ["chassis_force/x", "chassis_force/y", "chassis_torque/z"]
+    kinds = {state.name.partition("/")[0] for state in last.channels}
+    assert kinds >= {"chassis_force", "chassis_torque"} and not kinds & {"gyro", "accelerometer"}
     assert last.silent == ("gyro", "accelerometer/x", "accelerometer/y")
     assert "gyro has no sensor now" in last.problems
     assert last.level is Level.OK
