@@ -29,8 +29,8 @@ class EffectParameter:
         linear: the contribution is proportional to this parameter (all linear parameters together are additive).
         near_linear: it is so near zero, where the effect vanishes with it; its derivative there tells how the effect shows.
         reciprocal: its inverse is so: the effect vanishes as the parameter grows.
-        neutral: of a near-linear parameter that is neutral at the described value instead of zero: where in the
-            description that stands, as "contact.relaxation_length".
+        neutral: where the effect vanishes, if not at zero or without bound: a number, or where in the description it
+            stands, as "contact.relaxation_length".
         clause: what the effect's sentence goes on with where the number is not its default; `{name}` stands for it.
     """
 
@@ -44,7 +44,7 @@ class EffectParameter:
     linear: bool = False
     near_linear: bool = False
     reciprocal: bool = False
-    neutral: str = ""
+    neutral: str | float = ""
     clause: str = ""
 
 

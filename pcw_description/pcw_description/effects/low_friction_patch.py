@@ -35,7 +35,9 @@ EFFECT = ContactEffect(
         "A patch of {length:.3g} m by {width:.3g} m at ({x:.3g}, {y:.3g}) m, where friction is {factor:.3g} of the usual."
     ),
     parameters=(
-        EffectParameter("factor", "1", "friction on the patch relative to the floor's", 0.0, 10.0, 0.3),
+        EffectParameter(
+            "factor", "1", "friction on the patch relative to the floor's", 1e-3, 10.0, 0.3, reciprocal=True, neutral=1.0
+        ),
         EffectParameter("x", "m", "centre in the world", -1e4, 1e4, 1.0),
         EffectParameter("y", "m", "centre in the world", -1e4, 1e4, 1.0, default=0.0),
         EffectParameter("length", "m", "whole length", 0.02, 1e4, 0.5, default=0.5),

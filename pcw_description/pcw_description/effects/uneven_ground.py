@@ -28,7 +28,7 @@ EFFECT = ContactEffect(
     summary="The floor has waves: the load shifts between the wheels, and each wheel climbs and descends.",
     sentence="The floor has waves of {amplitude:.3g} m, every {wavelength:.3g} m, turned by {direction:.3g} rad.",
     parameters=(
-        EffectParameter("amplitude", "m", "height of the crests", 0.0, 0.1, 2e-3),
+        EffectParameter("amplitude", "m", "height of the crests", 0.0, 0.1, 2e-3, near_linear=True),
         EffectParameter("wavelength", "m", "from crest to crest", 0.05, 100.0, 1.0, default=1.0),
         EffectParameter("direction", "rad", "of the waves in the world", -6.3, 6.3, 0.0, default=0.0),
     ),

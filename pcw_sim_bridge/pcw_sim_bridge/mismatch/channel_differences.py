@@ -57,8 +57,8 @@ class ChannelDifferences:
     def of_lean(self, change: FloatArray) -> FloatArray:
         """What a lean of gravity by `change` (3,) adds to the residual, (T, C)."""
         pieces = []
-        for motion, plain in zip(self.motions, self._sides, strict=True):
-            measured, predicted = plain[0].copy(), plain[1].copy()
+        for motion, around, plain in zip(self.motions, self._around, self._sides, strict=True):
+            measured, predicted = self.model.sides(motion, self.model.around_leaning(motion, around, change))
             self.model.lean(motion, change, measured, predicted)
             pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
         return self.filtered(pieces)

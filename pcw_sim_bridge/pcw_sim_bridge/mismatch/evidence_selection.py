@@ -17,10 +17,19 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .noise_model import SLOW_ORDINATES, fit_noise_model, huber_weights, robust_deviation, white_noise_model
-from .regression_problem import FloatArray, IntArray, RegressionProblem, contiguous_blocks, segment_slices
+from .regression_problem import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RegressionProblem,
+    contiguous_blocks,
+    segment_slices,
+)
 from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression, predicted
 
 Progress = Callable[[str], None]
+# So many times columns are made exact at the sizes that were found with those before.
+EXACT_ROUNDS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,8 +117,56 @@ class EffectSearch:
             regression = self.whiten_at(self.residual_of(instances))
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
+        instances = self.made_exact(instances)
+        regression = self.whiten_at(self.residual_of(instances))
         threshold = self.calibrate(regression, instances)
-        return self.prune(regression, instances, threshold)
+        selection = self.prune(regression, instances, threshold)
+        return self.conclude(self.made_exact(selection.fit.instances), threshold)
+
+    def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
+        """Make the problem's columns exact at the sizes of these effects, and search their shapes again with these.
+
+        An effect of some size is not proportional to its parameters; what its first order leaves would pass for others.
+        """
+        terms = self.problem.terms
+        if all(terms[instance.term].secants is None for instance in instances):
+            return instances
+        for _ in range(EXACT_ROUNDS):
+            problem, residual = self.problem, self.residual_of(instances)
+            regression = self.whiten_at(residual)
+            points = self._sizes_of(regression.fit(instances))
+            self.problem = problem.at(points)
+            regression = self.whiten_at(residual)
+            again = instances
+            for index, instance in enumerate(instances):
+                if terms[instance.term].secants is not None:
+                    others = (*again[:index], *again[index + 1 :])
+                    again = (*again[:index], self.refine_shape(regression, others, instance), *again[index + 1 :])
+            if self._error(self.residual_of(again), residual) >= self._error(residual, residual):
+                self.problem = problem
+                break
+            instances = again
+        return instances
+
+    def _sizes_of(self, fit: Fit) -> dict[int, FloatArray]:
+        """Coefficients of every term in a fit whose columns can be made exact; of a term that is there twice, the last."""
+        position, found = len(self.problem.nuisances), {}
+        for instance in fit.instances:
+            term, count = self.problem.terms[instance.term], len(instance.active)
+            if term.secants is not None:
+                coefficients = np.zeros(len(term.parameters))
+                coefficients[list(instance.active)] = fit.mean[position : position + count]
+                found[instance.term] = coefficients
+            position += count
+        return found
+
+    def _error(self, residual: FloatArray, noise: FloatArray) -> float:
+        """Sum of squares of a residual (T, C) in units of the deviations of another, outliers held down."""
+        valid, total = self.problem.valid, 0.0
+        for channel, deviation in enumerate(self.channel_deviations(noise)):
+            values = residual[valid[:, channel], channel] / deviation
+            total += float(np.sum(huber_weights(values) * values**2))
+        return total
 
     def channel_deviations(self, residual: FloatArray) -> FloatArray:
         """Standard deviation of every channel of a residual (T, C), outliers held down, (C,)."""
@@ -435,13 +492,16 @@ class EffectSearch:
             losses.append(fit.log_evidence - without.log_evidence)
             # Held-out error alone would not mind a mass far outside its tolerance; the description would.
             retuning = regression.tolerance_cost(without) - regression.tolerance_cost(fit)
-            held_out.append(0.5 * float(np.sum(regression.block_scores(others) - full_scores)) + retuning)
+            once = self.problem.terms[instance.term].once
+            support = losses[-1] if once else 0.5 * float(np.sum(regression.block_scores(others) - full_scores))
+            held_out.append(support + retuning)
             columns = self.problem.columns(instance.term, instance.shape)[..., list(instance.active)]
             part = columns @ fit.mean[position : position + len(instance.active)]
             position += len(instance.active)
             own.append(self._sizes(part))
             # What a term does for the prediction is what the others cannot do in its place.
-            net.append(self._sizes(explained - predicted(self.problem, without)))
+            change = explained - predicted(self.problem, without)
+            net.append(self._sizes(change, _at_work(part) if once else None))
             retunings.append(retuning)
         total = np.sqrt(np.sum(np.square(own), axis=0))
         floor = np.maximum(self.settings.smallest_share * remains, self.settings.smallest_part * total)
@@ -454,9 +514,9 @@ class EffectSearch:
             shares.append(max(share, retuning / self.settings.smallest_threshold))
         return losses, held_out, shares
 
-    def _sizes(self, values: FloatArray) -> FloatArray:
-        """Root mean square of (T, C) over valid samples, per channel."""
-        valid = self.problem.valid
+    def _sizes(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
+        """Root mean square of (T, C) over valid samples, per channel; `among` some samples (T,) only."""
+        valid = self.problem.valid if among is None else self.problem.valid & among[:, None]
         counts = np.maximum(valid.sum(axis=0), 1)
         sizes: FloatArray = np.sqrt(np.sum(np.where(valid, values, 0.0) ** 2, axis=0) / counts)
         return sizes
@@ -466,6 +526,13 @@ class EffectSearch:
         term = self.problem.terms[instance.term]
         shape = ", ".join(f"{name} {value:.4g}" for name, value in instance.shape if name in term.resolution)
         return f"{term.key} ({shape})" if shape else term.key
+
+
+def _at_work(part: FloatArray) -> BoolArray:
+    """Samples (T,) in which a contribution (T, C) is a fair part of its largest in some channel."""
+    largest = np.maximum(np.max(np.abs(part), axis=0), 1e-300)
+    at_work: BoolArray = np.any(np.abs(part) > 0.2 * largest, axis=1)
+    return at_work
 
 
 def _phase_randomised(values: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -1,4 +1,6 @@
-"""A first look at a robot's residual for what has too many places to be tried one by one: the orders of a ripple.
+"""A first look at a robot's residual for what can be in too many places to be tried one by one.
+
+That is the order of a ripple, beginning and end of a push, a place on the floor, length and direction of waves.
 
 The tolerances are fitted first, as closely as their sizes allow. What remains is held against every order by sums alone;
 the best of them are worth an exact fit. A choice among many is paid for as such (`Term.grid_size`).
@@ -8,15 +10,33 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy import signal as filters
 
 from .noise_model import robust_deviation
 from .regression_problem import BoolArray, FloatArray, Nuisance
 
 LARGEST_ORDER = 400.0
 MOST_ORDERS = 4
+# Pushes last so long [s]; patches of floor measure so much [m], on a grid of such cells.
+LONGEST_PUSH, SHORTEST_PUSH = 12.0, 0.2
+PATCHES = (0.12, 0.18, 0.27, 0.4, 0.6, 0.9)
+CELL, MOST_CELLS = 0.05, 400
+# A patch that most of the way lies on is a floor.
+LARGEST_PATCH_PART = 0.4
+WAVES, WAVE_DIRECTIONS = (0.15, 5.0), 24
+MOST_SHAPES = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class ChosenShapes:
+    """Shapes that a first look chose, the best of `among` tried, with the scale and the spacing of a search around them."""
+
+    shapes: tuple[dict[str, float], ...]
+    among: int
+    resolution: Mapping[str, tuple[str, float]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,12 +47,39 @@ class Chosen:
     among: int
 
 
-def remainder(residual: FloatArray, valid: BoolArray, nuisances: Sequence[Nuisance]) -> FloatArray:
-    """Residual (T, C) over its noise, tolerances fitted, zero where it is not to be judged."""
+@dataclasses.dataclass(frozen=True)
+class Looked:
+    """The residual as a first look sees it.
+
+    Attributes:
+        left: over its noise, tolerances fitted, zero where it is not to be judged (T, C); deviation: that noise (C,).
+        valid: samples that may be judged (T, C).
+        time: since each recording's start (T,) [s]; rate: samples per second.
+        angle: of every joint (T, n, 2) [rad].
+        places: of the wheels' centres in the world (T, n, 2) [m]; heading: of the wheels there (T, n) [rad].
+    """
+
+    left: FloatArray
+    deviation: FloatArray
+    valid: BoolArray
+    time: FloatArray
+    rate: float
+    angle: FloatArray
+    places: FloatArray
+    heading: FloatArray
+
+    def held_against(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How much of columns (T, C, K) is in the residual, and how much there would be of one unit: (T, K) each."""
+        scaled = np.where(self.valid[:, :, None], columns / self.deviation[:, None], 0.0)
+        return np.einsum("tc,tck->tk", self.left, scaled), np.einsum("tck,tck->tk", scaled, scaled)
+
+
+def remainder(residual: FloatArray, valid: BoolArray, nuisances: Sequence[Nuisance]) -> tuple[FloatArray, FloatArray]:
+    """Residual (T, C) over its noise, tolerances fitted, zero where it is not to be judged; and that noise (C,)."""
     deviations = np.array([max(robust_deviation(residual[valid[:, c], c]), 1e-300) for c in range(residual.shape[1])])
     target = np.where(valid, residual / deviations, 0.0)
     if not nuisances:
-        return target
+        return target, deviations
     columns = np.stack([n.column * n.deviation for n in nuisances], axis=2) / deviations[:, None]
     columns = np.where(valid[:, :, None], columns, 0.0).reshape(-1, len(nuisances))
     flat = target.ravel()
@@ -40,8 +87,7 @@ def remainder(residual: FloatArray, valid: BoolArray, nuisances: Sequence[Nuisan
     left = (flat - columns @ fitted).reshape(residual.shape)
     # Over its noise again, now that the tolerances no longer pass for it.
     scale = [max(robust_deviation(left[valid[:, c], c]), 1e-300) for c in range(left.shape[1])]
-    result: FloatArray = left / np.array(scale)
-    return result
+    return left / np.array(scale), deviations * np.array(scale)
 
 
 def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
@@ -73,3 +119,112 @@ def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
         found.append(float(tried[best]))
         power[max(0, best - 4) : best + 5] = 0.0
     return Chosen(np.array(found), len(tried))
+
+
+def windows(looked: Looked, columns: FloatArray) -> ChosenShapes:
+    """Return the times (`start`, `duration`) in which something is at work that would else be so all the time.
+
+    Args:
+        columns: of all its parameters, at work all the time (T, C, K), each in channels of its own.
+    """
+    held, there = looked.held_against(columns)
+    index = np.floor(looked.time * looked.rate).astype(np.int64)
+    count = int(index.max()) + 1
+    sums = []
+    for values in (held, there):
+        binned = np.zeros((count, values.shape[1]))
+        np.add.at(binned, index, values)
+        sums.append(np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(binned, axis=0)]))
+    lengths = np.arange(max(1, round(SHORTEST_PUSH * looked.rate)), min(count // 2, round(LONGEST_PUSH * looked.rate)))
+    found: list[tuple[float, int, int]] = []
+    tried = 0
+    for length in lengths:
+        moment, energy = (s[length:] - s[:-length] for s in sums)
+        gain = np.sum(moment**2 / np.maximum(energy, 1e-300), axis=1)
+        best = int(np.argmax(gain))
+        tried += len(gain)
+        found.append((float(gain[best]), best, int(length)))
+    kept: list[tuple[int, int]] = []
+    for _, start, length in sorted(found, reverse=True):
+        if all(start + length <= other or other + more <= start for other, more in kept):
+            kept.append((start, length))
+        if len(kept) == MOST_SHAPES:
+            break
+    step = 1.0 / looked.rate
+    shapes = tuple({"start": start * step, "duration": length * step} for start, length in kept)
+    return ChosenShapes(shapes, tried, {"start": ("linear", step), "duration": ("linear", step)})
+
+
+def patches(looked: Looked, columns: FloatArray) -> ChosenShapes:
+    """Return places on the floor (`x`, `y`, `length`, `width`) where something is at work under every wheel that comes there.
+
+    Args:
+        columns: of each wheel, at work everywhere (T, C, n).
+    """
+    held, there = looked.held_against(columns)
+    places = looked.places.reshape(-1, 2)
+    low, high = places.min(axis=0), places.max(axis=0)
+    cell = max(CELL, float(np.max(high - low)) / MOST_CELLS)
+    size = tuple((np.floor((high - low) / cell) + 1).astype(np.int64))
+    index = np.floor((places - low) / cell).astype(np.int64)
+    maps = []
+    for values in (held, there):
+        floor = np.zeros(size)
+        np.add.at(floor, (index[:, 0], index[:, 1]), values.ravel())
+        maps.append(floor)
+    whole = float(maps[1].sum())
+    found: list[tuple[float, float, float, float]] = []
+    for radius in PATCHES:
+        reach = int(np.ceil(radius / cell))
+        if 2 * reach + 1 > 2 * max(size):
+            break
+        offsets = np.arange(-reach, reach + 1) * cell
+        disc = (offsets[:, None] ** 2 + offsets**2 <= radius**2).astype(np.float64)
+        moment, energy = (filters.oaconvolve(m, disc, mode="same") for m in maps)
+        enough = (energy > 1e-6 * whole) & (energy < LARGEST_PATCH_PART * whole) & (moment > 0.0)
+        gain = np.where(enough, moment**2 / np.maximum(energy, 1e-6 * whole + 1e-300), 0.0)
+        for _ in range(MOST_SHAPES):
+            row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
+            if gain[row, column] <= 0.0:
+                break
+            x, y = low + (np.array([row, column]) + 0.5) * cell
+            found.append((float(gain[row, column]), float(x), float(y), radius))
+            gain[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 0.0
+    kept = sorted(found, reverse=True)[: 2 * MOST_SHAPES]
+    shapes = tuple({"x": x, "y": y, "length": 2.0 * r, "width": 2.0 * r} for _, x, y, r in kept)
+    resolution = {"x": ("linear", 0.1), "y": ("linear", 0.1), "length": ("log", 1.6), "width": ("log", 1.6)}
+    return ChosenShapes(shapes, int(np.count_nonzero(maps[1])) * len(PATCHES), resolution)
+
+
+def waves(looked: Looked, climbing: FloatArray) -> ChosenShapes:
+    """Return the waves of the floor (`wavelength`, `direction`) that the wheels seem to climb.
+
+    Args:
+        climbing: what a slope of one along each wheel's heading adds to the channels (T, C, n).
+    """
+    held, there = looked.held_against(climbing)
+    x, y = looked.places[:, :, 0], looked.places[:, :, 1]
+    extent = max(float(np.ptp(x)), float(np.ptp(y)), 1e-3)
+    numbers = np.arange(1.0 / WAVES[1], 1.0 / WAVES[0], min(0.25 / extent, 0.5))
+    directions = np.arange(WAVE_DIRECTIONS) * math.tau / WAVE_DIRECTIONS
+    gain = np.zeros((len(numbers), len(directions)))
+    for column, direction in enumerate(directions):
+        c, s = math.cos(direction), math.sin(direction)
+        along, across = c * x + s * y, -s * x + c * y
+        to_wave = looked.heading - direction
+        forward, aside = np.cos(to_wave), np.sin(to_wave)
+        for row, number in enumerate(numbers):
+            k = math.tau * number
+            slope = k * (np.cos(k * along) * np.cos(k * across) * forward - np.sin(k * along) * np.sin(k * across) * aside)
+            moment, energy = float(np.sum(held * slope)), float(np.sum(there * slope**2))
+            gain[row, column] = moment**2 / max(energy, 1e-300) if moment > 0.0 else 0.0
+    tried = gain.size
+    shapes: list[dict[str, float]] = []
+    for _ in range(2 * MOST_SHAPES):
+        row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        if gain[row, column] <= 0.0:
+            break
+        shapes.append({"wavelength": 1.0 / float(numbers[row]), "direction": float(directions[column])})
+        gain[max(0, row - 1) : row + 2, column] = 0.0
+    spacing = 0.5 * math.tau / WAVE_DIRECTIONS
+    return ChosenShapes(tuple(shapes), tried, {"wavelength": ("log", 1.12), "direction": ("linear", spacing)})

@@ -164,5 +164,9 @@ def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance]
         place = places[term.key]
         shown = {parameter.name: k for k, parameter in enumerate(other.terms[place].parameters)}
         columns = other.columns(place, instance.shape)
+        if instance.term in problem.points:  # exact at the same sizes
+            point = dict(zip((p.name for p in term.parameters), problem.points[instance.term], strict=True))
+            sizes = np.array([point.get(name, 0.0) for name in shown])
+            columns = other.terms[place].at(sizes).columns(dict(instance.shape))
         parts.append(np.stack([columns[..., shown[n]] if n in shown else nothing for n in names], axis=2))
     return np.concatenate(parts, axis=2) if parts else np.zeros((*nothing.shape, 0))

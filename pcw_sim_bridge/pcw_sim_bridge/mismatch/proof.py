@@ -189,25 +189,21 @@ class Prover:
     def _misleading(
         self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None
     ) -> tuple[int, str] | None:
-        """Where the simulation follows less well with the patch: the effect without which it follows best."""
+        """An effect with which the simulation follows less well than with the others and the numbers re-tuned to them."""
         windows = self._quiet_windows(explanation)
         terms = explanation.search.problem.terms
         moving = [k for k in held_out.proposed if moves_the_robot(terms[held_out.instances[k].term].effect)]
         if windows is None or self.before is None or after is None or not moving:
             return None
 
-        def errors(squares: FloatArray) -> PairedErrors:
-            assert self.before is not None
-            return _rollout_errors(windows, self.before, squares, self.rng, [MAIN_HORIZON]).pooled()
-
-        if errors(after).worse()[0] == 0.0:
-            return None
-        follows = []
+        harms = []
         for index in moving:
-            squares = self._rollout(explanation, held_out, index)
-            assert squares is not None
-            follows.append((float(errors(squares).after[0]), index))
-        return min(follows)[1], "the simulation follows less well with it"
+            without = self._rollout(explanation, held_out, index)
+            assert without is not None
+            errors = _rollout_errors(windows, without, after, self.rng, [MAIN_HORIZON]).pooled()
+            harms.append((float(errors.worse()[0]), index))
+        worst, index = max(harms)
+        return (index, "the simulation follows less well with it") if worst > 0.0 else None
 
     def _rollout(self, explanation: Explanation, held_out: HeldOut, without: int | None = None) -> FloatArray | None:
         """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""

@@ -66,7 +66,7 @@ class LinearParameter:
         lower, upper, deviation: bounds and prior deviation of the coefficient.
         refinement: zero unless there is evidence for it; not part of the effect when it is first named.
         origin: value of the parameter where the coefficient is zero.
-        reciprocal: the coefficient is the inverse of the parameter.
+        reciprocal: the coefficient is the inverse of the parameter, less that of the origin.
         hidden: it is no number of the effect, only of how much of it there is.
     """
 
@@ -83,8 +83,12 @@ class LinearParameter:
     def value(self, coefficient: float) -> float:
         """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""
         if self.reciprocal:
-            return 1.0 / max(coefficient, 1e-12)
+            return 1.0 / max(coefficient + 1.0 / self.origin, 1e-12)
         return self.origin + coefficient
+
+    def coefficient(self, value: float) -> float:
+        """Return the coefficient of a value."""
+        return 1.0 / value - 1.0 / self.origin if self.reciprocal else value - self.origin
 
     def interval(self, low: float, high: float) -> tuple[float, float]:
         """Return the parameter's interval for one of the coefficient."""
@@ -111,6 +115,9 @@ class Term:
         grid_size: how many shapes `shapes` were chosen from, where a first look has narrowed them down.
         log_prior: of the effect (see there), part of every evidence.
         whole: shaping parameters that are whole numbers unless the recording says otherwise (periods per turn).
+        secants: shape and coefficients (P,) -> columns that are exact there instead of near zero, where an effect is linear in
+            its parameters only to first order; None where it is so altogether.
+        once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
     """
 
     effect: str
@@ -126,6 +133,15 @@ class Term:
     log_prior: float = 0.0
     axis: str | None = None
     whole: tuple[str, ...] = ()
+    secants: Callable[[Shape, FloatArray], FloatArray] | None = None
+    once: bool = False
+
+    def at(self, coefficients: FloatArray) -> Term:
+        """Return the term with columns that are exact at coefficients (P,)."""
+        secants = self.secants
+        if secants is None:
+            return self
+        return dataclasses.replace(self, columns=lambda shape: secants(shape, coefficients))
 
     @property
     def key(self) -> str:
@@ -173,6 +189,7 @@ class RegressionProblem:
         scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
             known no better, and an effect that is no larger is not told from it.
         sites: where an unknown torque or force may act; None where nothing measured would show it.
+        points: coefficients at which the columns of some terms are exact, by term.
     """
 
     channels: tuple[Channel, ...]
@@ -189,6 +206,7 @@ class RegressionProblem:
     misjudged: FloatArray | None = None
     scale_deviation: float = 0.0
     sites: Sites | None = None
+    points: Mapping[int, FloatArray] = dataclasses.field(default_factory=dict)
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -222,6 +240,13 @@ class RegressionProblem:
         wider = dataclasses.replace(self, terms=(*self.terms, *terms))
         wider._remembered.update(self._remembered)
         return wider
+
+    def at(self, points: Mapping[int, FloatArray]) -> RegressionProblem:
+        """Return the problem with columns that are exact at some coefficients of terms, by term; others stay as they are."""
+        terms = tuple(term.at(points[k]) if k in points else term for k, term in enumerate(self.terms))
+        moved = dataclasses.replace(self, terms=terms, points={**self.points, **points})
+        moved._remembered.update({key: value for key, value in self._remembered.items() if key[0] not in points})
+        return moved
 
     def nuisance_columns(self) -> FloatArray:
         """Nuisance columns side by side, (T, C, K)."""

@@ -17,12 +17,12 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDes
 from ..plants.true_robot import as_it_really_is
 from .channel_differences import ChannelDifferences
 from .errors import MismatchError
-from .first_look import remainder
+from .first_look import Looked, remainder
 from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, Term
 from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
 from .robot_nuisances import robot_nuisances
-from .robot_terms import Looked, robot_terms
+from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, twists
 from .signal_filter import SignalFilter
 
@@ -99,8 +99,9 @@ class RobotProblemBuilder:
         terms: tuple[Term, ...] = ()
         if with_terms:
             angle = differences.filtered([motion.position for motion in self.motions])
-            left = remainder(differences.residual, valid, nuisances)
-            terms = tuple(robot_terms(self.robot, differences, Looked(left, rate, angle)))
+            left, deviation = remainder(differences.residual, valid, nuisances)
+            looked = Looked(left, deviation, valid, time, rate, angle, *self._wheels())
+            terms = tuple(robot_terms(self.robot, differences, looked))
         return RegressionProblem(
             channels=self.channels(),
             time=time,
@@ -117,6 +118,15 @@ class RobotProblemBuilder:
             scale_deviation=self._scale_deviation(),
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
         )
+
+    def _wheels(self) -> tuple[FloatArray, FloatArray]:
+        """Places (T, n, 2) [m] and headings (T, n) [rad] of the wheels in the world."""
+        places, headings = [], []
+        for motion, own in zip(self.motions, self.filters, strict=True):
+            centres = np.stack([self.model.wheel_places(motion, i) for i in range(self.robot.n)], axis=1)
+            places.append(own.decimate(centres))
+            headings.append(own.decimate(motion.pose[:, 2:] + motion.position[:, :, STEER]))
+        return np.concatenate(places), np.concatenate(headings)
 
     def _scale_deviation(self) -> float:
         """Relative deviation of what all torque constants share, and of what the model neglects."""

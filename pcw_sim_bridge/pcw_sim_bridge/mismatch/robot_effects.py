@@ -29,6 +29,7 @@ from pcw_description.effects.kinds import (
     FRICTION,
     GRADIENT_X,
     GRADIENT_Y,
+    HEIGHT,
     LOAD,
     POSE_X,
     POSE_YAW,
@@ -101,11 +102,11 @@ def _integral(values: FloatArray, steps: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * steps)])
 
 
-def normal_along(motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:
-    """Normal forces (T, n) [N] along a motion."""
+def normal_along(motion: RobotMotion, numbers: ModelNumbers, height: FloatArray | None = None) -> FloatArray:
+    """Normal forces (T, n) [N] along a motion, over ground of a height (T, n) [m]."""
     angle = np.ascontiguousarray(motion.position[:, :, STEER])
     twist, _ = twists(numbers, angle, motion.velocity)
-    return normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)))
+    return normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)), height)
 
 
 def with_true_angles(
@@ -156,12 +157,27 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
 
 
 def true_motion(robot: RobotDescription, motion: RobotMotion) -> RobotMotion:
-    """Return the motion without the errors of readings, and the give of gears, that the robot's `physics` hold."""
+    """Return the motion without the errors of readings and clocks, and the give of gears, that the robot's `physics` hold."""
     for instance in robot.physics:
         effect = get(instance.name)
         if isinstance(effect, (EncoderEffect, TransmissionEffect)):
             motion = with_true_angles(robot, motion, effect, instance.target, instance.parameters, instance.axis)
+        elif isinstance(effect, ClockEffect):
+            inertial, tracked = (effect.offset(topic, instance.parameters) for topic in ("imu/data", "ground_truth/odom"))
+            motion = dataclasses.replace(
+                motion,
+                imu=_later(motion, motion.imu, inertial),
+                pose=_later(motion, motion.pose, tracked),
+                tracked_twist=_later(motion, motion.tracked_twist, tracked),
+            )
     return motion
+
+
+def _later(motion: RobotMotion, values: FloatArray, offset: float) -> FloatArray:
+    """Signals (T, K) of a motion read an offset later [s]."""
+    if offset == 0.0:
+        return values
+    return np.stack([np.interp(motion.time + offset, motion.time, column) for column in values.T], axis=1)
 
 
 @compiled_for_kernel(
@@ -203,6 +219,8 @@ class ChannelModel:
     def around_with(self, motion: RobotMotion, around: Surroundings, instance: EffectInstance) -> Surroundings:
         """Return the surroundings with a further effect on joints or under wheels; others change nothing here."""
         effect = get(instance.name)
+        if isinstance(effect, GravityEffect):
+            return self.around_leaning(motion, around, effect.gravity(instance.parameters))
         if not isinstance(effect, (JointTorqueEffect, ContactEffect)):
             return around
         shape = motion.position.shape
@@ -217,14 +235,26 @@ class ChannelModel:
             return dataclasses.replace(around, torque=torque)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
         grip = np.ones(shape[:2]) if around.grip is None else around.grip.copy()
-        for name in instance.target:
-            i = self.robot.caster_index(name)
-            found = self._under_wheel(motion, effect, i, instance.parameters, normal)
+        height = np.zeros(shape[:2]) if around.height is None else around.height.copy()
+        under = {
+            i: self._under_wheel(motion, effect, i, instance.parameters, normal)
+            for i in map(self.robot.caster_index, instance.target)
+        }
+        for i, found in under.items():
             radius[:, i] += found[:, RADIUS_CHANGE]
             grip[:, i] *= found[:, FRICTION]
+            height[:, i] += found[:, HEIGHT] + found[:, RADIUS_CHANGE]
+        if height.any():
+            normal = normal_along(motion, self.numbers, height)
+        for i, found in under.items():
             torque[:, i, DRIVE] -= normal[:, i] * found[:, RADIUS_SLOPE]
             torque[:, i, DRIVE] += self._climbing(motion, i, normal[:, i], found)
-        return Surroundings(torque, radius, grip)
+        return dataclasses.replace(around, torque=torque, radius=radius, grip=grip, height=height)
+
+    def around_leaning(self, motion: RobotMotion, around: Surroundings, change: FloatArray) -> Surroundings:
+        """Return the surroundings with gravity whose unit vector leans further by `change` (3,), in axes of the yaw."""
+        pull = self._pull(motion, change)
+        return dataclasses.replace(around, pull=pull if around.pull is None else around.pull + pull)
 
     def wheel_places(self, motion: RobotMotion, i: int) -> FloatArray:
         """Centre of wheel i in the world (T, 2) [m]."""
@@ -255,7 +285,8 @@ class ChannelModel:
         """Measured and predicted side of every channel along a true motion, (T, C) each."""
         sides = channel_sides(motion, numbers or self.numbers, self.layout, around)
         for instance in self.robot.physics:
-            self._apply(motion, get(instance.name), instance.parameters, *sides)
+            if not isinstance(effect := get(instance.name), ClockEffect):  # a true motion has the right times
+                self._apply(motion, effect, instance.parameters, *sides)
         return sides
 
     def sides_with(self, motion: RobotMotion, around: Surroundings, plain: Sides, instance: EffectInstance) -> Sides:
@@ -275,7 +306,10 @@ class ChannelModel:
             return self.sides(with_true_angles(self.robot, motion, effect, *place), around)
         if isinstance(effect, (JointTorqueEffect, ContactEffect)):
             return self.sides(motion, self.around_with(motion, around, instance))
-        sides = plain[0].copy(), plain[1].copy()
+        if isinstance(effect, GravityEffect):  # the lean itself besides, which `sides` adds for the robot's own effects only
+            sides = self.sides(motion, self.around_with(motion, around, instance))
+        else:
+            sides = plain[0].copy(), plain[1].copy()
         self._apply(motion, effect, instance.parameters, *sides)
         return sides
 
@@ -298,6 +332,7 @@ class ChannelModel:
             predicted[:, layout.inertial] = np.column_stack([rate[:, 2], acceleration[:, :2]])
         elif isinstance(effect, ClockEffect):
             # What bears the stamp t was sensed the offset earlier: what was sensed at t bears t + offset.
+            # A derivative, not a shift: of two samples one has the noise that the residual has too.
             if layout.imu:
                 measured[:, layout.inertial] += effect.offset("imu/data", values) * derivative(motion.imu, motion.rate)
             if layout.pose:
@@ -321,32 +356,23 @@ class ChannelModel:
         at[:, [COM_X, COM_Y, COM_Z]] = self._mass_and_centre()[1]
         return at
 
-    def _held_by_steering(self, motion: RobotMotion, along: FloatArray, across: FloatArray) -> FloatArray:
-        """Wrench (T, 3) of the side forces by which the wheels hold their modules' weights against turning downhill.
-
-        Of the steering's balance, b_x F_y = ... - (m c x g), what gravity g (T,) in base_link adds to F_y.
-        """
-        wrench = np.zeros((len(motion.time), 3))
-        for i, (module, b) in enumerate(zip(self.numbers.modules, self.numbers.caster_offset, strict=True)):
-            c, s = np.cos(motion.position[:, i, STEER]), np.sin(motion.position[:, i, STEER])
-            lever_x, lever_y = module[1] * c - module[2] * s, module[1] * s + module[2] * c
-            side = -module[0] * (lever_x * across - lever_y * along) / b[0]
-            place_x = self.numbers.steer_axis[i, 0] + b[0] * c - b[1] * s
-            place_y = self.numbers.steer_axis[i, 1] + b[0] * s + b[1] * c
-            wrench += np.column_stack([-s * side, c * side, (place_x * c + place_y * s) * side])
-        return wrench
-
-    def lean(self, motion: RobotMotion, change: FloatArray, measured: FloatArray, predicted: FloatArray) -> None:
-        """Change both sides as gravity does whose unit vector leans by `change` (3,), in the axes of the yaw."""
+    def _pull(self, motion: RobotMotion, change: FloatArray) -> FloatArray:
+        """What gravity pulls along base_link's axes (T, 2) [m/s^2] when it leans by `change` (3,) in those of the yaw."""
         pull = GRAVITY * change
         c, s = np.cos(motion.pose[:, 2]), np.sin(motion.pose[:, 2])
-        along, across = c * pull[0] + s * pull[1], c * pull[1] - s * pull[0]
+        return np.column_stack([c * pull[0] + s * pull[1], c * pull[1] - s * pull[0]])
+
+    def lean(self, motion: RobotMotion, change: FloatArray, measured: FloatArray, predicted: FloatArray) -> None:
+        """Change both sides as gravity does whose unit vector leans by `change` (3,), in axes of the yaw.
+
+        What it changes of the forces under the wheels is that of the surroundings' `pull`.
+        """
+        along, across = self._pull(motion, change).T
         if self.layout.balanced:
             mass, centre = self._mass_and_centre()
             measured[:, 0] += mass * along
             measured[:, 1] += mass * across
             measured[:, 2] += mass * (centre[0] * across - centre[1] * along)
-            measured[:, :3] += self._held_by_steering(motion, along, across)
         if self.layout.imu:
             predicted[:, self.layout.inertial.start + 1] -= along
             predicted[:, self.layout.inertial.start + 2] -= across

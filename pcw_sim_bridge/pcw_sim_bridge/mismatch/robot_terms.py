@@ -18,6 +18,7 @@ from pcw_description.effects.effect import Effect, EffectParameter
 from pcw_description.effects.kinds import (
     ActuatorEffect,
     ChassisForceEffect,
+    ClockEffect,
     ContactEffect,
     DescriptionEffect,
     JointTorqueEffect,
@@ -28,7 +29,7 @@ from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
 from .axis_channels import kernel_arguments
 from .channel_differences import ChannelDifferences
-from .first_look import Chosen, orders
+from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
@@ -42,20 +43,6 @@ _ARGUMENT_NAMES = {"position": "angle", "velocity": "velocity", "force": "torque
 def robot_terms(robot: RobotDescription, differences: ChannelDifferences, looked: Looked) -> list[Term]:
     """Return all candidates whose effects show in the channels; `looked` is what a first look needs."""
     return _TermMaker(robot, differences, looked).terms()
-
-
-@dataclasses.dataclass(frozen=True)
-class Looked:
-    """The residual as a first look sees it.
-
-    Attributes:
-        left: over its noise, tolerances fitted (T, C); rate: samples per second.
-        angle: of every joint (T, n, 2) [rad].
-    """
-
-    left: FloatArray
-    rate: float
-    angle: FloatArray
 
 
 class _TermMaker:
@@ -72,8 +59,11 @@ class _TermMaker:
         for effect in all_effects().values():
             if isinstance(effect, ActuatorEffect):
                 continue
+            targets = everything if effect.target_kind == "caster" else [(effect.target_kind,)]
+            if _look_of(effect) in ("patches", "waves"):  # the floor is under all wheels
+                targets = [self.robot.caster_names]
             for axis in effect.axes or (None,):
-                for target in everything if effect.target_kind == "caster" else [(effect.target_kind,)]:
+                for target in targets:
                     term = (
                         self._joint_term(effect, target, axis)
                         if isinstance(effect, JointTorqueEffect)
@@ -174,26 +164,26 @@ class _TermMaker:
             return None
         if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):
             return None
-        grid = self._grid(effect)
-        if grid is None:
-            return None
-        shapes, resolution = grid
         neutral = {p.name: self._neutral(p) for p in searched}
+        look = _look_of(effect)
+        chosen = self._looked_for(effect, look, neutral) if look else self._grid(effect)
+        if chosen is None or not chosen.shapes:
+            return None
+        shapes = chosen.shapes
 
         def columns(shape: Shape, names: Sequence[str]) -> FloatArray:
-            found = []
-            for name in names:
-                parameter = effect.parameter(name)
-                step, value = _step(parameter, neutral[name])
-                instance = EffectInstance(effect.name, target, {**shape, **neutral, name: value}, axis)
-                found.append(self.differences.of_effect(instance) / step)
-            return np.stack(found, axis=2)
+            return np.stack([self._difference(effect, target, axis, shape, neutral, name) for name in names], axis=2)
 
         everything = columns(shapes[0], [p.name for p in searched])
         shown = [p for k, p in enumerate(searched) if np.abs(everything[:, :, k]).max() > 0.0]
         if not shown:
             return None
         names = [p.name for p in shown]
+        parameters = tuple(_linear(p, neutral[p.name]) for p in shown)
+
+        def secants(shape: Shape, coefficients: FloatArray) -> FloatArray:
+            return self._secants(effect, target, axis, {**shape, **neutral}, parameters, coefficients)
+
         return Term(
             effect=effect.name,
             axis=axis,
@@ -202,9 +192,68 @@ class _TermMaker:
             shapes=shapes,
             columns=lambda shape: columns(shape, names),
             arguments=VARIABLES_OF.get(type(effect), ()),
-            parameters=tuple(_linear(p, neutral[p.name]) for p in shown),
-            resolution=resolution,
+            parameters=parameters,
+            secants=None if isinstance(effect, ClockEffect) else secants,
+            resolution=chosen.resolution,
+            grid_size=chosen.among,
+            once=look in ("windows", "patches"),
         )
+
+    def _looked_for(self, effect: Effect, look: str, neutral: Mapping[str, float]) -> ChosenShapes:
+        """Where and when an effect may be at work, by a first look; its other parameters at their defaults."""
+        rest = {p.name: p.default for p in effect.parameters if p.default is not None and p.name not in neutral}
+        if look == "windows":
+            always = {**rest, **neutral, "start": 0.0, "duration": 1e6}
+            names = [p.name for p in effect.searched_parameters]
+            columns = [self._difference(effect, ("chassis",), None, always, neutral, name) for name in names]
+            found = windows(self.looked, np.stack(columns, axis=2))
+        elif look == "patches":
+            everywhere = {**rest, **neutral, "x": 0.0, "y": 0.0, "length": 1e4, "width": 1e4}
+            name = effect.searched_parameters[0].name
+            casters = self.robot.caster_names
+            columns = [self._difference(effect, (caster,), None, everywhere, neutral, name) for caster in casters]
+            found = patches(self.looked, np.stack(columns, axis=2))
+        else:
+            found = waves(self.looked, self._climbing())
+        return dataclasses.replace(found, shapes=tuple({**rest, **shape} for shape in found.shapes))
+
+    def _climbing(self) -> FloatArray:
+        """What a slope of one along each wheel's heading adds to the channels (T, C, n)."""
+        radius, columns = self.robot.wheel_radius, []
+        for i in range(self.robot.n):
+            torques = []
+            for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
+                torque = np.zeros((*motion.position.shape, 1))
+                torque[:, i, 0, 0] = -radius[i] * normal[:, i]
+                torques.append(torque)
+            columns.append(self.differences.of_torque(torques)[:, :, 0])
+        return np.stack(columns, axis=2)
+
+    def _difference(
+        self, effect: Effect, target: tuple[str, ...], axis: str | None, at: Shape, neutral: Mapping[str, float], name: str
+    ) -> FloatArray:
+        """Column (T, C) of one parameter of an effect, the others as in `at` or neutral."""
+        step, value = _step(effect.parameter(name), neutral[name])
+        return self.differences.of_effect(EffectInstance(effect.name, target, {**at, **neutral, name: value}, axis)) / step
+
+    def _secants(
+        self, effect: Effect, target: tuple[str, ...], axis: str | None, neutral: Mapping[str, float],
+        parameters: Sequence[LinearParameter], coefficients: FloatArray,
+    ) -> FloatArray:  # fmt: skip
+        """Columns (T, C, P) that together with the coefficients (P,) give what the effect does there, one after the other."""
+        at = dict(neutral)
+        before = self.differences.of_effect(EffectInstance(effect.name, target, at, axis))
+        columns = []
+        for parameter, coefficient in zip(parameters, coefficients, strict=True):
+            step, _ = _step(effect.parameter(parameter.name), neutral[parameter.name])
+            width = float(np.clip(coefficient, parameter.lower, parameter.upper))
+            width = width if abs(width) > 0.1 * step else step
+            moved = {**at, parameter.name: parameter.value(width)}
+            after = self.differences.of_effect(EffectInstance(effect.name, target, moved, axis))
+            columns.append((after - before) / width)
+            if width == coefficient:
+                at, before = moved, after
+        return np.stack(columns, axis=2)
 
     def _has_rotors(self, target: Sequence[str], axis: str) -> bool:
         """Whether there are motors that a gear could let turn on their own."""
@@ -213,6 +262,8 @@ class _TermMaker:
 
     def _neutral(self, parameter: EffectParameter) -> float:
         """Value at which the parameter changes nothing."""
+        if isinstance(parameter.neutral, float):
+            return parameter.neutral
         if parameter.reciprocal:
             return parameter.upper
         if parameter.neutral:
@@ -222,7 +273,7 @@ class _TermMaker:
             return float(value)  # type: ignore[arg-type]
         return 0.0
 
-    def _grid(self, effect: Effect) -> tuple[tuple[dict[str, float], ...], Mapping[str, tuple[str, float]]] | None:
+    def _grid(self, effect: Effect) -> ChosenShapes | None:
         """Grid of the shaping parameters of an effect and its spacing; None where one can neither be searched nor left."""
         reach = np.max(np.abs(self.robot.steer_axis), axis=0)
         searched = {p.name for p in effect.searched_parameters}
@@ -243,7 +294,16 @@ class _TermMaker:
             else:
                 return None
             shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
-        return tuple(shapes), resolution
+        return ChosenShapes(tuple(shapes), 0, resolution)
+
+
+def _look_of(effect: Effect) -> str:
+    """Which first look an effect needs, by what shapes it: none, "windows" of time, "patches" or "waves" of the floor."""
+    names = {p.name for p in effect.parameters} - {p.name for p in effect.searched_parameters}
+    for look, shaping in (("windows", {"start", "duration"}), ("waves", {"wavelength", "direction"})):
+        if shaping <= names:
+            return look
+    return "patches" if isinstance(effect, ContactEffect) and {"x", "y", "length", "width"} <= names else ""
 
 
 def _spacing(parameter: EffectParameter, looked: Looked) -> tuple[str, float]:
@@ -257,7 +317,7 @@ def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:
     """Step of the linear coefficient that a difference is taken over, and the parameter's value there."""
     if parameter.reciprocal:
         step = 0.1 / parameter.typical
-        return step, 1.0 / step
+        return step, 1.0 / (step + 1.0 / neutral)
     step = 0.1 * parameter.typical
     return step, neutral + step
 
@@ -266,7 +326,8 @@ def _linear(parameter: EffectParameter, neutral: float) -> LinearParameter:
     """The parameter as a regression coefficient: its inverse, or its distance from where it changes nothing."""
     if parameter.reciprocal:
         return LinearParameter(
-            parameter.name, parameter.unit, 0.0, 1.0 / parameter.lower, 3.0 / parameter.typical, reciprocal=True
+            parameter.name, parameter.unit, 1.0 / parameter.upper - 1.0 / neutral, 1.0 / parameter.lower - 1.0 / neutral,
+            3.0 / parameter.typical, origin=neutral, reciprocal=True,
         )
     return LinearParameter(
         parameter.name, parameter.unit, parameter.lower - neutral, parameter.upper - neutral, 3.0 * parameter.typical,

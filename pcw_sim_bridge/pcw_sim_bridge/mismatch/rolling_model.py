@@ -104,11 +104,15 @@ class Surroundings:
         torque: on the joints besides the motors' (T, n, 2) [N m].
         radius: change of the rolling radius (T, n) [m].
         grip: factor on the friction under each wheel (T, n).
+        height: of the ground under each wheel, and of what it is larger by (T, n) [m].
+        pull: of gravity along base_link's axes (T, 2) [m/s^2].
     """
 
     torque: FloatArray | None = None
     radius: FloatArray | None = None
     grip: FloatArray | None = None
+    height: FloatArray | None = None
+    pull: FloatArray | None = None
 
 
 NOTHING = Surroundings()
@@ -127,6 +131,7 @@ class ModelNumbers:
         tyres: numbers of the tyres (n, TYRE_SIZE); softness: slip at the contact per slip of these (n, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
         clock: how much later than the joints' the stamps of IMU and tracker are (2,) [s].
+        spring: of the chassis over each wheel [N/m].
         lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
             chassis leans on its springs (2,) [s^2].
     """
@@ -147,6 +152,7 @@ class ModelNumbers:
     softness: FloatArray
     torque_lag: float
     clock: FloatArray
+    spring: float
     lean: FloatArray
 
     @property
@@ -181,6 +187,7 @@ class ModelNumbers:
             softness=np.ones((robot.n, 2)),
             torque_lag=0.0,
             clock=np.zeros(2),
+            spring=robot.wheel_suspension.stiffness,
             lean=np.zeros(2),
         )
 
@@ -310,38 +317,39 @@ def _inertial_wrench(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _normal_forces(mass, com_x, com_y, com_z, steer_axis, caster_offset, steer_angle, acceleration):  # type: ignore[no-untyped-def]
-    """Quasi-static normal forces (T, n) [N] from the accelerations (T, 2)."""
+def _normal_forces(mass, com, spring, steer_axis, caster_offset, steer_angle, acceleration, height):  # type: ignore[no-untyped-def]
+    """Quasi-static normal forces (T, n) [N] from the accelerations (T, 2), on ground of a height (T, n)."""
     normal = np.empty_like(steer_angle)
     centre = np.empty_like(steer_axis)
-    level = np.zeros(len(steer_axis))
     for t in range(len(steer_angle)):
         for i in range(steer_angle.shape[1]):
             c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
             centre[i, 0] = steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
             centre[i, 1] = steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
-        moment_x = mass * (GRAVITY * com_x - com_z * acceleration[t, 0])
-        moment_y = mass * (GRAVITY * com_y - com_z * acceleration[t, 1])
-        # On level ground the load does not depend on how stiff equal springs are.
-        support_forces(mass * GRAVITY, moment_x, moment_y, 1.0, centre, level, normal[t])
+        moment_x = mass * (GRAVITY * com[0] - com[2] * acceleration[t, 0])
+        moment_y = mass * (GRAVITY * com[1] - com[2] * acceleration[t, 1])
+        support_forces(mass * GRAVITY, moment_x, moment_y, spring, centre, height[t], normal[t])
     return normal
 
 
-def normal_forces(numbers: ModelNumbers, steer_angle: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Quasi-static normal forces (T, n) [N] on the wheels under accelerations (T, 2 or more) in base_link."""
+def normal_forces(
+    numbers: ModelNumbers, steer_angle: FloatArray, acceleration: FloatArray, height: FloatArray | None = None
+) -> FloatArray:
+    """Quasi-static normal forces (T, n) [N] on the wheels.
+
+    Args:
+        acceleration: of base_link in its own axes (T, 2 or more).
+        height: of the ground under each wheel (T, n) [m]; None where it is level.
+    """
     chassis, modules = numbers.chassis, numbers.modules
     mass = numbers.total_mass
     centre = (chassis[0] * chassis[1:3] + (modules[:, :1] * numbers.steer_axis).sum(axis=0)) / mass
+    # On level ground the load does not depend on how stiff equal springs are, and rigid ones know no other.
+    height = np.zeros(steer_angle.shape) if height is None or numbers.spring == 0.0 else height
     forces: FloatArray = _normal_forces(
-        mass,
-        centre[0],
-        centre[1],
-        numbers.height_of_mass,
-        numbers.steer_axis,
-        numbers.caster_offset,
-        steer_angle,
-        acceleration,
-    )
+        mass, np.array([*centre, numbers.height_of_mass]), numbers.spring or 1.0, numbers.steer_axis,
+        numbers.caster_offset, steer_angle, acceleration, height,
+    )  # fmt: skip
     return forces
 
 
@@ -450,7 +458,11 @@ def rolling_state(
     radius = np.ascontiguousarray(radius)
     twist, contradiction = twists(numbers, steer_angle, velocity)
     twist_dot = derivative(twist, motion.rate)
-    normal = normal_forces(numbers, steer_angle, acceleration_of(twist, twist_dot))
+    felt = twist_dot  # on a slope, forces and loads are those of a robot that is accelerated uphill
+    if around.pull is not None:
+        felt = twist_dot.copy()
+        felt[:, :2] -= around.pull
+    normal = normal_forces(numbers, steer_angle, acceleration_of(twist, felt), around.height)
     grip = np.maximum(normal if around.grip is None else normal * around.grip, 1.0)
     speed = np.abs(velocity[:, :, DRIVE] * numbers.radius)
     spin = _scrub(numbers.tyres, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
@@ -459,10 +471,10 @@ def rolling_state(
         if around.torque is not None:
             torque = torque + around.torque
         force = _contact_forces(
-            numbers.modules, *geometry, radius, steer_angle, velocity, motion.acceleration, torque, spin, twist, twist_dot
+            numbers.modules, *geometry, radius, steer_angle, velocity, motion.acceleration, torque, spin, twist, felt
         )
     else:
-        force = _shared_forces(*geometry, steer_angle, inertial_wrench(numbers, motion, steer_angle, twist, twist_dot))
+        force = _shared_forces(*geometry, steer_angle, inertial_wrench(numbers, motion, steer_angle, twist, felt))
     return RollingState(steer_angle, radius, velocity, twist, twist_dot, contradiction, grip, speed, spin, force)
 
 

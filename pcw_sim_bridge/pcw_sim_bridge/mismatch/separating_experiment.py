@@ -322,7 +322,7 @@ def _term_of(problem: RegressionProblem, effect: EffectInstance) -> Term:
 def _coefficients(term: Term, size: Mapping[str, float], names: Sequence[str]) -> FloatArray:
     """What the columns of some parameters of a term are multiplied by, for given values of the parameters."""
     chosen = [p for p in term.parameters if p.name in names]
-    return np.array([1.0 / size[p.name] if p.reciprocal else size[p.name] - p.origin for p in chosen])
+    return np.array([p.coefficient(size[p.name]) for p in chosen])
 
 
 def _not_searched(problem: RegressionProblem, name: str, target: tuple[str, ...] | None) -> str:
