@@ -281,7 +281,10 @@ class OpenSetTest:
         return bases
 
     def _unexplained(self) -> FloatArray:
-        """Residual (T, C) after additive functions of all variables: the noise to judge every single one by."""
+        """Residual (T, C) after additive functions of all variables: the noise to judge every single one by.
+
+        Grown by what so many functions take of mere noise.
+        """
         left = self.residual.copy()
         for channel in range(left.shape[1]):
             columns = [functions for (c, _), (functions, _) in self.bases.items() if c == channel]
@@ -291,8 +294,11 @@ class OpenSetTest:
             stacked = np.concatenate([*columns, np.ones((len(left), 1))], axis=1)
             size = np.maximum(np.sqrt(np.mean(stacked[valid] ** 2, axis=0)), 1e-300)
             scaled = stacked[valid] / size
-            gram = scaled.T @ scaled + 1e-3 * len(scaled) * np.eye(scaled.shape[1])
+            plain = scaled.T @ scaled
+            gram = plain + 1e-3 * len(scaled) * np.eye(scaled.shape[1])
             left[:, channel] -= stacked / size @ np.linalg.solve(gram, scaled.T @ left[valid, channel])
+            freedom = float(np.trace(np.linalg.solve(gram, plain)))
+            left[:, channel] *= np.sqrt(len(scaled) / max(len(scaled) - freedom, 0.1 * len(scaled)))
         return left
 
     def run(self, threshold: float) -> OpenSetResult:

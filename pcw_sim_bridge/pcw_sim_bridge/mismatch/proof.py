@@ -8,6 +8,7 @@ not proposed; nor is one with which the simulation follows less well than withou
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -276,8 +277,12 @@ class Prover:
         blank = np.where(problem.valid, 1.0, np.nan)
         before, left = ((values * blank / spread) ** 2 for values in (problem.residual, problem.residual - predicted))
         inverse = PairedErrors.of(before, left, blocks_of(problem.recording, problem.time), self.rng)
-        floors = explanation.floor / spread
+        floors = _floors(explanation, problem) / spread
         judged = inverse.judged
+        # The gap is measured in noise floors: of channels with different noise, those that an effect departs from tell most.
+        relative = PairedErrors.of(
+            before / floors**2, left / floors**2, blocks_of(problem.recording, problem.time), self.rng
+        ).pooled()
         pooled, floor = inverse.pooled(), float(np.sqrt(np.mean(floors[judged] ** 2))) if len(judged) else 0.0
         worse = {problem.channels[k].name: float(inverse.worse()[k]) for k in judged}
         for recording in np.unique(problem.recording):
@@ -289,8 +294,8 @@ class Prover:
         at = max(worse, key=lambda name: worse[name], default=None)
         harm = worse[at] if at is not None else 0.0
         main = [entry for entry in rollouts if entry.horizon == HORIZONS[MAIN_HORIZON]]
-        closed = gap_closed(np.sqrt(pooled.before), np.sqrt(pooled.after), floor)
-        draws = gap_closed(np.sqrt(pooled.before_draws), np.sqrt(pooled.after_draws), floor)
+        closed = gap_closed(np.sqrt(relative.before), np.sqrt(relative.after), 1.0)
+        draws = gap_closed(np.sqrt(relative.before_draws), np.sqrt(relative.after_draws), 1.0)
         return FitFinding(
             source=held_out.source,
             inverse_nrmse=(float(np.sqrt(pooled.before[0])), float(np.sqrt(pooled.after[0]))),
@@ -334,6 +339,16 @@ class Prover:
         return tuple(found), gap
 
 
+def _floors(explanation: Explanation, problem: RegressionProblem) -> FloatArray:
+    """Error of every channel (C,) that noise, and what the model itself misjudges, leave in any case."""
+    floors = np.maximum(explanation.floor, 1e-300)
+    if problem.misjudged is None:
+        return floors
+    squares = np.where(problem.valid, problem.misjudged**2, 0.0).sum(axis=0) / np.maximum(problem.valid.sum(axis=0), 1)
+    result: FloatArray = np.hypot(floors, np.sqrt(squares))
+    return result
+
+
 def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFinding:
     """Return the finding with further channels in its errors and in the gap that is closed."""
     if not more:
@@ -345,13 +360,17 @@ def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFindi
 
     before, after = together([c.before for c in channels]), together([c.after for c in channels])
     floor = together([c.floor for c in channels])
+    first, last = (
+        together([getattr(c, name) / max(c.floor, 1e-300) for c in channels if math.isfinite(c.floor)])
+        for name in ("before", "after")
+    )
     worst = max(more, key=lambda c: c.after / max(c.before, 1e-300))
     grown = worst.after / max(worst.before, 1e-300) - 1.0 if worst.after_ci95[0] > worst.before_ci95[1] else 0.0
     return dataclasses.replace(
         finding,
         inverse_nrmse=(before, after),
         inverse_floor=floor,
-        gap_closed=float(gap_closed(np.array(before), np.array(after), floor)),
+        gap_closed=float(gap_closed(np.array(first), np.array(last), 1.0)),
         channels=channels,
         harm=max(finding.harm, grown),
         harm_at=worst.name if grown > finding.harm else finding.harm_at,
