@@ -27,10 +27,11 @@ from .findings import (
     Trace,
     UnknownFinding,
 )
+from .found_effect import effect_instance
 from .generated_effect import NoSuchKernelError, generate
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
-from .proof import Proof, Prover, effect_instance, with_channels
+from .proof import Proof, Prover, with_channels
 from .regression_problem import FloatArray, RegressionProblem
 from .subject import Subject
 from .whitened_regression import Fit, predicted
@@ -205,7 +206,7 @@ def _rms(values: FloatArray, valid: np.ndarray) -> FloatArray:
 
 def _channels(explanation: Explanation) -> tuple[ChannelFinding, ...]:
     problem = explanation.search.problem
-    nominal = _rms(problem.residual, problem.valid)
+    nominal = _rms(problem.nominal_residual, problem.valid)
     return tuple(
         ChannelFinding(
             channel.name, channel.unit, float(nominal[c]), float(explanation.floor[c]), float(explanation.p_values[c]),
@@ -248,7 +249,7 @@ def _traces(problem: RegressionProblem, explained: FloatArray, fit: Fit, role: s
     time_on_end = _on_end(problem)
     traces = []
     for c, channel in enumerate(problem.channels):
-        nominal = problem.measured[:, c] - problem.residual[:, c]
+        nominal = problem.measured[:, c] - problem.nominal_residual[:, c]
         blank = np.where(problem.valid[:, c], 1.0, np.nan)
         traces.append(
             Trace(
@@ -276,7 +277,7 @@ def _residual_map(explanation: Explanation, path: FloatArray | None) -> Residual
     blank = np.where(problem.valid, 1.0, np.nan)
     any_valid = problem.valid.any(axis=1)
     sides = []
-    for left in (problem.residual, problem.residual - predicted(problem, explanation.fit)):
+    for left in (problem.nominal_residual, problem.residual - predicted(problem, explanation.fit)):
         counts = np.maximum(problem.valid.sum(axis=1), 1)
         power = np.nansum((left * blank / floor) ** 2, axis=1) / counts
         sides.append(np.where(any_valid, np.sqrt(power), np.nan))

@@ -12,9 +12,9 @@ from pcw_description.effect_instance import EffectInstance
 from .evidence_selection import EffectSearch, SelectionSettings
 from .explanation import Explanation, NamedTerm, explain
 from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
+from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
-from .proof import effect_instance
 from .regression_problem import FloatArray, RegressionProblem
 
 Progress = Callable[[str], None]

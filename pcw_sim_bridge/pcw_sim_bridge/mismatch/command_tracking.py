@@ -42,6 +42,7 @@ PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
 # Torques at which a drive may give no more, by how much of the time more was asked of it.
+LARGEST_QUANTILES = (0.8, 0.95, 0.99, 0.999)
 QUANTILES = (0.3, 0.5, 0.65, 0.8, 0.88, 0.94, 0.97, 0.985)
 KNEES = (0.2, 0.4, 0.6, 0.8)  # parts of the largest speed from which the voltage limits
 
@@ -223,7 +224,9 @@ class _JointProblem:
         if first.unit != "N m":
             return (), {}
         command = np.abs(self._plain)
-        torques = np.unique(np.quantile(command, QUANTILES))
+        measured = np.abs(np.concatenate([piece.torque for piece in self.pieces]))
+        # A limit is a torque that was asked for, or the largest that came.
+        torques = np.unique([*np.quantile(command, QUANTILES), *np.quantile(measured, LARGEST_QUANTILES)])
         shapes = [{**defaults, first.name: float(t)} for t in torques if t > 0.0]
         resolution = {first.name: ("log", 1.3)}
         if {"knee_speed", "no_load_speed"} <= set(defaults):

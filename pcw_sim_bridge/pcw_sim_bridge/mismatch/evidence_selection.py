@@ -16,9 +16,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .noise_model import SLOW_ORDINATES, fit_noise_model, huber_weights, robust_deviation, white_noise_model
+from .noise_model import (
+    SLOW_ORDINATES,
+    NoiseModel,
+    fit_noise_model,
+    huber_weights,
+    robust_deviation,
+    white_noise_model,
+)
 from .regression_problem import (
     BoolArray,
+    EffectSize,
     FloatArray,
     IntArray,
     RegressionProblem,
@@ -28,8 +36,12 @@ from .regression_problem import (
 from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression, predicted
 
 Progress = Callable[[str], None]
-# So many times columns are made exact at the sizes that were found with those before.
+# So many times the problem is made exact where its fit came out.
 EXACT_ROUNDS = 3
+# A fit that moves less than this part of its intervals' deviations has arrived.
+STEADY = 0.2
+# So many times the noise is estimated again, until no channel's falls by more than this.
+SETTLING_ROUNDS, SETTLED = 8, 0.9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +51,8 @@ class SelectionSettings:
     Attributes:
         false_alarm_rate: share of recordings with nothing missing in which something may be named.
         lenient_gain: nats to enter the first, over-complete model.
-        smallest_threshold: nats below which nothing is named however quiet the surrogates are (odds of 150 to 1).
+        smallest_threshold: nats below which nothing is named however quiet the surrogates are (odds of 8000 to 1): evidence
+            takes the model for exact, and many small errors of it look like small effects.
         smallest_share: a term must move some channel by at least this part of the rms that remains there. Below it lie
             the details that no model of a real machine gets right, and they repeat as faithfully as an effect does.
         smallest_part: a term must also move some channel by this part of what all effects together do: the shape of a
@@ -50,7 +63,7 @@ class SelectionSettings:
 
     false_alarm_rate: float = 0.005
     lenient_gain: float = 2.0
-    smallest_threshold: float = 5.0
+    smallest_threshold: float = 9.0
     smallest_share: float = 0.25
     smallest_part: float = 0.02
     blocks: int = 10
@@ -104,11 +117,18 @@ class EffectSearch:
         self.progress = progress
         self.block: IntArray = contiguous_blocks(problem.segment, self.settings.blocks)
         self.ladder: list[LadderStep] = []
+        # Where the problem is exact: the effects there, and all numbers of the fit.
+        self._point: tuple[object, FloatArray] | None = None
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
         self.noise_gain = (0.0, 1.0)
 
     def run(self) -> Selection:
         """Grow, calibrate, prune."""
+        for _ in range(EXACT_ROUNDS):
+            regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
+            self._settle(regression, ())
+            if not self._exact_at(regression.fit(())):
+                break
         instances = self.over_complete()
         regression = self.whiten_at(self.residual_of(instances))
         for _ in range(3):
@@ -121,44 +141,53 @@ class EffectSearch:
         regression = self.whiten_at(self.residual_of(instances))
         threshold = self.calibrate(regression, instances)
         selection = self.prune(regression, instances, threshold)
-        return self.conclude(self.made_exact(selection.fit.instances), threshold)
+        chosen = self.made_exact(selection.fit.instances)
+        selection = self.prune(self.whiten_at(self.residual_of(chosen)), chosen, threshold)
+        return selection
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
-        """Make the problem's columns exact at the sizes of these effects, and search their shapes again with these.
+        """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.
 
-        An effect of some size is not proportional to its parameters; what its first order leaves would pass for others.
+        What their first order leaves would pass for other effects.
         """
-        terms = self.problem.terms
-        if all(terms[instance.term].secants is None for instance in instances):
-            return instances
         for _ in range(EXACT_ROUNDS):
             problem, residual = self.problem, self.residual_of(instances)
-            regression = self.whiten_at(residual)
-            points = self._sizes_of(regression.fit(instances))
-            self.problem = problem.at(points)
+            if not self._exact_at(self.whiten_at(residual).fit(instances)):
+                break
             regression = self.whiten_at(residual)
             again = instances
             for index, instance in enumerate(instances):
-                if terms[instance.term].secants is not None:
+                if self.problem.terms[instance.term].once:
                     others = (*again[:index], *again[index + 1 :])
                     again = (*again[:index], self.refine_shape(regression, others, instance), *again[index + 1 :])
-            if self._error(self.residual_of(again), residual) >= self._error(residual, residual):
+            if self._error(self.residual_of(again), residual) > self._error(residual, residual):
                 self.problem = problem
                 break
             instances = again
         return instances
 
-    def _sizes_of(self, fit: Fit) -> dict[int, FloatArray]:
-        """Coefficients of every term in a fit whose columns can be made exact; of a term that is there twice, the last."""
-        position, found = len(self.problem.nuisances), {}
+    def _exact_at(self, fit: Fit) -> bool:
+        """Make the problem exact where a fit comes out; whether it was not so there."""
+        problem = self.problem
+        deviation = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
+        count = len(problem.nuisances)
+        changes = {n.name: float(mean) for n, mean in zip(problem.nuisances, fit.mean[:count], strict=True)}
+        sizes, position, flat = [], count, list(fit.mean[:count])
         for instance in fit.instances:
-            term, count = self.problem.terms[instance.term], len(instance.active)
-            if term.secants is not None:
-                coefficients = np.zeros(len(term.parameters))
-                coefficients[list(instance.active)] = fit.mean[position : position + count]
-                found[instance.term] = coefficients
-            position += count
-        return found
+            term = problem.terms[instance.term]
+            coefficients = np.zeros(len(term.parameters))
+            found = fit.mean[position : position + len(instance.active)]
+            bounds = [(term.parameters[k].lower, term.parameters[k].upper) for k in instance.active]
+            coefficients[list(instance.active)] = [float(np.clip(f, *b)) for f, b in zip(found, bounds, strict=True)]
+            flat += list(found)
+            sizes.append(EffectSize(instance.term, instance.shape, coefficients))
+            position += len(instance.active)
+        point = (tuple((i.term, i.shape) for i in fit.instances), np.array(flat))
+        before, self._point = self._point, point
+        if before is not None and before[0] == point[0] and np.all(np.abs(point[1] - before[1]) < STEADY * deviation):
+            return False
+        self.problem = problem.exact_at(changes, sizes)
+        return self.problem is not problem
 
     def _error(self, residual: FloatArray, noise: FloatArray) -> float:
         """Sum of squares of a residual (T, C) in units of the deviations of another, outliers held down."""
@@ -175,6 +204,11 @@ class EffectSearch:
 
     def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
         """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
+        noise, weights = self._noise_of(residual, white, by_channel)
+        return WhitenedRegression(self.problem, noise, weights, None if by_channel else self.block)
+
+    def _noise_of(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> tuple[NoiseModel, FloatArray]:
+        """Noise model of a residual (T, C) and the weights of its samples (T, C)."""
         problem = self.problem
         if white:
             noise = white_noise_model(residual, problem.valid)
@@ -189,7 +223,7 @@ class EffectSearch:
             weights[:, channel] = problem.channels[channel].information * robust
             if problem.misjudged is not None:
                 weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
-        return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)
+        return noise, weights
 
     def residual_of(self, instances: Sequence[Instance]) -> FloatArray:
         """Residual (T, C) of the least-squares fit of a set, with robust weights."""
@@ -208,6 +242,7 @@ class EffectSearch:
         """
         instances: tuple[Instance, ...] = ()
         regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
+        self._settle(regression, instances)
         while len(instances) < self.settings.largest_set:
             step = self.best_addition(regression, instances)
             if step is None or step.gain < self.settings.lenient_gain:
@@ -216,8 +251,21 @@ class EffectSearch:
                 break
             instances = (*instances, self.refine_shape(regression, instances, step.instance))
             instances = self.improve(regression, instances)
-            regression.rescale(self.channel_deviations(regression.unwhitened_residual(regression.fit(instances))))
+            self._settle(regression, instances)
         return instances
+
+    def _settle(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> None:
+        """Take for noise what a set and the tolerances leave, which is less the less noise is taken for granted.
+
+        Else many numbers, each well within its tolerance, would do for one effect: little as they explain, it would be enough.
+        """
+        deviations = regression.noise.taps[:, 0] ** -1.0
+        for _ in range(SETTLING_ROUNDS):
+            before = deviations
+            deviations = self.channel_deviations(regression.unwhitened_residual(regression.fit(instances)))
+            regression.rescale(deviations)
+            if np.all(deviations > SETTLED * before):
+                break
 
     def thin(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
         """Drop terms as long as that costs less than the lenient gain."""

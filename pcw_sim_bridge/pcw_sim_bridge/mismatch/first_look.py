@@ -21,7 +21,7 @@ from .regression_problem import BoolArray, FloatArray, Nuisance
 LARGEST_ORDER = 400.0
 MOST_ORDERS = 4
 # Pushes last so long [s]; patches of floor measure so much [m], on a grid of such cells.
-LONGEST_PUSH, SHORTEST_PUSH = 12.0, 0.2
+LONGEST_PUSH, SHORTEST_PUSH = 12.0, 0.4
 PATCHES = (0.12, 0.18, 0.27, 0.4, 0.6, 0.9)
 CELL, MOST_CELLS = 0.05, 400
 # A patch that most of the way lies on is a floor.

@@ -55,6 +55,7 @@ class HeldOut:
     ) -> HeldOut:
         """Hold out other recordings: fitted on all of `problem`, judged on `other`."""
         regression = selection.regression
+        other = _exact_elsewhere(problem, other)
         columns = _columns_elsewhere(problem, instances, other)
         flat = np.concatenate([columns, other.residual[:, :, None]], axis=2)
         everything = np.zeros(len(other.time), dtype=np.int64)
@@ -149,6 +150,23 @@ class HeldOut:
         return 0.5 * float(np.mean(np.sum(moved**2, axis=1)))
 
 
+def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> RegressionProblem:
+    """The other problem, exact where the first one is."""
+    if problem.point is None:
+        return other
+    places = {term.key: index for index, term in enumerate(other.terms)}
+    sizes = []
+    for size in problem.point.sizes:
+        if size.term >= len(problem.terms) or problem.terms[size.term].key not in places:
+            continue
+        term = problem.terms[size.term]
+        place = places[term.key]
+        known = dict(zip((p.name for p in term.parameters), size.coefficients, strict=True))
+        coefficients = np.array([known.get(p.name, 0.0) for p in other.terms[place].parameters])
+        sizes.append(dataclasses.replace(size, term=place, coefficients=coefficients))
+    return other.exact_at(problem.point.changes, sizes)
+
+
 def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance], other: RegressionProblem) -> FloatArray:
     """Columns (T, C, k) in another problem of the nuisances and effects of a problem, matched by name."""
     nuisances = {nuisance.name: nuisance.column for nuisance in other.nuisances}
@@ -164,9 +182,5 @@ def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance]
         place = places[term.key]
         shown = {parameter.name: k for k, parameter in enumerate(other.terms[place].parameters)}
         columns = other.columns(place, instance.shape)
-        if instance.term in problem.points:  # exact at the same sizes
-            point = dict(zip((p.name for p in term.parameters), problem.points[instance.term], strict=True))
-            sizes = np.array([point.get(name, 0.0) for name in shown])
-            columns = other.terms[place].at(sizes).columns(dict(instance.shape))
         parts.append(np.stack([columns[..., shown[n]] if n in shown else nothing for n in names], axis=2))
     return np.concatenate(parts, axis=2) if parts else np.zeros((*nothing.shape, 0))

@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.kinds import ClockEffect, ImuEffect
 from pcw_description.effects.registry import get
 
 from .errors import MismatchError
 from .explanation import AMBIGUOUS, Explanation
 from .findings import ChannelProof, FitFinding, LadderFinding, RolloutProof
+from .found_effect import effect_instance
 from .held_out import HeldOut
 from .paired_errors import PairedErrors, blocks_of, gap_closed, interval
 from .regression_problem import FloatArray, IntArray, RegressionProblem
@@ -55,17 +55,6 @@ class Proof:
     predicted: FloatArray
     dropped: tuple[LadderFinding, ...]
     notes: tuple[str, ...]
-
-
-def effect_instance(
-    effect_name: str, target: Sequence[str], values: Mapping[str, float], axis: str | None = None
-) -> EffectInstance:
-    """Return an effect with all its parameters, as it stands under `physics:`; defaults for those not given."""
-    effect = get(effect_name)
-    complete = {p.name: float(p.default or 0.0) for p in effect.parameters} | dict(values)
-    # Rounding of an estimate at its bound must not make a file that its own reader refuses.
-    bounded = {p.name: min(max(complete[p.name], p.lower), p.upper) for p in effect.parameters}
-    return EffectInstance(effect_name, tuple(target), bounded, axis)
 
 
 def is_event(effect_name: str) -> bool:
@@ -135,7 +124,8 @@ class Prover:
             explanation = self.reduce(explanation, kept)
         notes += self._remarks(explanation, held_out, after)
         nothing = not explanation.named
-        predicted = np.zeros_like(held_out.problem.residual) if nothing else held_out.predicted(held_out.means())
+        unchanged = held_out.problem.residual - held_out.problem.nominal_residual
+        predicted = unchanged if nothing else held_out.predicted(held_out.means())
         finding = self._finding(explanation, held_out, predicted, after)
         return Proof(explanation, finding, held_out, predicted, tuple(dropped), tuple(notes))
 
@@ -275,7 +265,7 @@ class Prover:
         problem = held_out.problem
         spread = _spread(problem)
         blank = np.where(problem.valid, 1.0, np.nan)
-        before, left = ((values * blank / spread) ** 2 for values in (problem.residual, problem.residual - predicted))
+        before, left = ((values * blank / spread) ** 2 for values in (problem.nominal_residual, problem.residual - predicted))
         inverse = PairedErrors.of(before, left, blocks_of(problem.recording, problem.time), self.rng)
         floors = _floors(explanation, problem) / spread
         judged = inverse.judged

@@ -115,8 +115,7 @@ class Term:
         grid_size: how many shapes `shapes` were chosen from, where a first look has narrowed them down.
         log_prior: of the effect (see there), part of every evidence.
         whole: shaping parameters that are whole numbers unless the recording says otherwise (periods per turn).
-        secants: shape and coefficients (P,) -> columns that are exact there instead of near zero, where an effect is linear in
-            its parameters only to first order; None where it is so altogether.
+        is_exact: the problem's exact residual holds it.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
     """
 
@@ -133,15 +132,8 @@ class Term:
     log_prior: float = 0.0
     axis: str | None = None
     whole: tuple[str, ...] = ()
-    secants: Callable[[Shape, FloatArray], FloatArray] | None = None
+    is_exact: bool = False
     once: bool = False
-
-    def at(self, coefficients: FloatArray) -> Term:
-        """Return the term with columns that are exact at coefficients (P,)."""
-        secants = self.secants
-        if secants is None:
-            return self
-        return dataclasses.replace(self, columns=lambda shape: secants(shape, coefficients))
 
     @property
     def key(self) -> str:
@@ -152,6 +144,23 @@ class Term:
     def base_indices(self) -> tuple[int, ...]:
         """Positions of the parameters that are not refinements."""
         return tuple(i for i, parameter in enumerate(self.parameters) if not parameter.refinement)
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectSize:
+    """A term of a problem at work: with a shape, and with coefficients of all its parameters (P,)."""
+
+    term: int
+    shape: tuple[tuple[str, float], ...]
+    coefficients: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """Where a problem is exact: changes of nuisances, by name, and sizes of effects."""
+
+    changes: Mapping[str, float]
+    sizes: tuple[EffectSize, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +198,10 @@ class RegressionProblem:
         scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
             known no better, and an effect that is no larger is not told from it.
         sites: where an unknown torque or force may act; None where nothing measured would show it.
-        points: coefficients at which the columns of some terms are exact, by term.
+        exact: (changes of nuisances by name, sizes of effects) -> residual (T, C) of the model with all of them at work, and
+            the names of the nuisances that it holds; None from it where there is no such model, and instead of it where the
+            columns are exact everywhere.
+        nominal: residual of the description as it is, where `residual` is exact elsewhere; point: where.
     """
 
     channels: tuple[Channel, ...]
@@ -206,7 +218,9 @@ class RegressionProblem:
     misjudged: FloatArray | None = None
     scale_deviation: float = 0.0
     sites: Sites | None = None
-    points: Mapping[int, FloatArray] = dataclasses.field(default_factory=dict)
+    exact: Callable[[Mapping[str, float], Sequence[EffectSize]], tuple[FloatArray, Sequence[str]] | None] | None = None
+    nominal: FloatArray | None = None
+    point: Point | None = None
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -241,12 +255,39 @@ class RegressionProblem:
         wider._remembered.update(self._remembered)
         return wider
 
-    def at(self, points: Mapping[int, FloatArray]) -> RegressionProblem:
-        """Return the problem with columns that are exact at some coefficients of terms, by term; others stay as they are."""
-        terms = tuple(term.at(points[k]) if k in points else term for k, term in enumerate(self.terms))
-        moved = dataclasses.replace(self, terms=terms, points={**self.points, **points})
-        moved._remembered.update({key: value for key, value in self._remembered.items() if key[0] not in points})
+    def exact_at(self, changes: Mapping[str, float], sizes: Sequence[EffectSize]) -> RegressionProblem:
+        """Return the problem with a residual that the columns explain exactly where numbers and effects are of these sizes.
+
+        Columns are derivatives at the description. To the residual of the model there, r(x), is added what the columns take:
+        r(x) + J x. A fit that comes out at x has then found a minimum of the model itself, not of its first order.
+
+        Args:
+            changes: of the nuisances, by name.
+            sizes: of the effects at work.
+        """
+        if self.exact is None:
+            return self
+        known = {nuisance.name: nuisance for nuisance in self.nuisances}
+        changes = {name: change for name, change in changes.items() if name in known}
+        found = self.exact(changes, [size for size in sizes if size.term < len(self.terms)])
+        if found is None:
+            return self
+        residual, taken = found
+        for name in taken:
+            residual = residual + known[name].column * changes[name]
+        for size in sizes:
+            if size.term < len(self.terms) and self.terms[size.term].is_exact:
+                residual = residual + self.columns(size.term, size.shape) @ size.coefficients
+        moved = dataclasses.replace(
+            self, residual=residual, nominal=self.nominal_residual, point=Point(dict(changes), tuple(sizes))
+        )
+        moved._remembered.update(self._remembered)
         return moved
+
+    @property
+    def nominal_residual(self) -> FloatArray:
+        """What the description as it is leaves (T, C)."""
+        return self.residual if self.nominal is None else self.nominal
 
     def nuisance_columns(self) -> FloatArray:
         """Nuisance columns side by side, (T, C, K)."""

@@ -6,11 +6,15 @@ nuisance column, and every effect a candidate; both by differences of the whole 
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy import ndimage
 
 from pcw_description.effects.drive_coulomb_friction import SMOOTHING_SPEED
+from pcw_description.errors import PcwError
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
 
@@ -18,10 +22,11 @@ from ..plants.true_robot import as_it_really_is
 from .channel_differences import ChannelDifferences
 from .errors import MismatchError
 from .first_look import Looked, remainder
-from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, Term
+from .found_effect import effect_instance
+from .regression_problem import BoolArray, Channel, EffectSize, FloatArray, RegressionProblem, Sites, Term
 from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
-from .robot_nuisances import robot_nuisances
+from .robot_nuisances import robot_nuisances, varied_numbers
 from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, twists
 from .signal_filter import SignalFilter
@@ -33,6 +38,7 @@ SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 MODEL_DEVIATION = 0.007
 # By about this part it misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
+RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
 
@@ -69,6 +75,7 @@ class RobotProblemBuilder:
         # Numbers that effects in the description already change belong to the nominal model.
         described = as_it_really_is(robot)
         self.numbers = ModelNumbers.of(described)
+        self._read = motions
         self.motions = with_pose([true_motion(described, motion) for motion in motions], self.numbers)
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
         self.model = ChannelModel(described, self.numbers, self.layout)
@@ -117,7 +124,38 @@ class RobotProblemBuilder:
             misjudged=self._misjudged(differences),
             scale_deviation=self._scale_deviation(),
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
+            exact=functools.partial(self._exact, differences, terms) if with_terms else None,
         )
+
+    def _exact(
+        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[EffectSize]
+    ) -> tuple[FloatArray, Sequence[str]] | None:
+        """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be."""
+        instances = []
+        for size in sizes:
+            term = terms[size.term]
+            if term.is_exact:
+                values = dict(size.shape)
+                for parameter, coefficient in zip(term.parameters, size.coefficients, strict=True):
+                    values[parameter.name] = parameter.value(float(coefficient))
+                instances.append(effect_instance(term.effect, term.target, values, term.axis))
+        try:
+            described = as_it_really_is(dataclasses.replace(self.robot, physics=(*self.robot.physics, *instances)))
+        except PcwError:
+            return None
+        numbers = ModelNumbers.of(described)
+        taken = []
+        for number in varied_numbers(self.robot, differences):
+            if number.label in changes:
+                number.vary(numbers, changes[number.label])
+                taken.append(number.label)
+        model = ChannelModel(described, numbers, self.layout)
+        motions = with_pose([true_motion(described, motion) for motion in self._read], numbers)
+        pieces = []
+        for motion in motions:
+            measured, predicted = model.sides(motion, model.around(motion))
+            pieces.append(np.nan_to_num(measured - predicted))
+        return differences.filtered(pieces), taken
 
     def _wheels(self) -> tuple[FloatArray, FloatArray]:
         """Places (T, n, 2) [m] and headings (T, n) [rad] of the wheels in the world."""
@@ -151,6 +189,9 @@ class RobotProblemBuilder:
             slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
             speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * reach
             bad = slip > SLIP_FLOOR + SLIP_FRACTION * speed
+            # What a filter makes of forces that no model follows reaches beyond the slip itself.
+            reach_of_filter = round(RINGING * motion.rate / self.cutoff)
+            bad = ndimage.binary_dilation(bad, iterations=max(reach_of_filter, 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
             pieces.append((bad[:, None] | ~known).astype(float))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -19,14 +20,34 @@ Deviation = tuple[str, str, float, Vary]
 Index = int | tuple[int, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class VariedNumber:
+    """A number of the channel model that a healthy robot may differ in; the first four as those of `Nuisance`."""
+
+    label: str
+    unit: str
+    nominal: float
+    deviation: float
+    vary: Vary
+
+
 def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) -> list[Nuisance]:
     """Return every number that has a tolerance and shows in the channels, and the lean of the floor."""
+    found = [
+        Nuisance(n.label, n.unit, n.nominal, n.deviation, differences.of_numbers(n.vary, 0.5 * n.deviation))
+        for n in varied_numbers(robot, differences)
+    ]
+    return found + _floor(robot, differences)
+
+
+def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> list[VariedNumber]:
+    """Return all of these that are numbers of the channel model."""
     found = []
     layout = differences.model.layout
     if layout.balanced:
         # A drive reports the torque of some instant within its own cycle; nobody knows which.
         sampling = max(motion.sampling for motion in differences.motions)
-        found.append(_nuisance(differences, "torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
+        found.append(VariedNumber("torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
     found += _suspension(robot, differences)
     deviations = list(_geometry(robot))
     if layout.balanced:
@@ -41,14 +62,8 @@ def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) ->
         known = robot.tolerance(tolerance)
         deviation = known.value * abs(nominal) if known.relative else known.value
         if deviation > 0.0:
-            found.append(_nuisance(differences, label, known.unit, nominal, deviation, vary))
-    return found + _floor(robot, differences)
-
-
-def _nuisance(
-    differences: ChannelDifferences, label: str, unit: str, nominal: float, deviation: float, vary: Vary
-) -> Nuisance:
-    return Nuisance(label, unit, nominal, deviation, differences.of_numbers(vary, 0.5 * deviation))
+            found.append(VariedNumber(label, known.unit, nominal, deviation, vary))
+    return found
 
 
 def _entry(name: str, index: Index | None = None) -> Vary:
@@ -96,7 +111,7 @@ def _gain(index: int, axis: int) -> Vary:
     return vary
 
 
-def _suspension(robot: RobotDescription, differences: ChannelDifferences) -> list[Nuisance]:
+def _suspension(robot: RobotDescription, differences: ChannelDifferences) -> list[VariedNumber]:
     """How far the chassis leans on its springs when it accelerates: anything between not at all and twice as described.
 
     A force m a at the height h tilts it by m a h / (k sum x^2), and moves the centre of mass by that tilt times h.
@@ -110,7 +125,7 @@ def _suspension(robot: RobotDescription, differences: ChannelDifferences) -> lis
         stiffness = robot.wheel_suspension.stiffness * float(np.sum(arms**2))
         if stiffness > 0.0:
             lean = numbers.total_mass * numbers.height_of_mass**2 / stiffness
-            found.append(_nuisance(differences, f"suspension.lean.{axis}", "s^2", 0.0, lean, _entry("lean", k)))
+            found.append(VariedNumber(f"suspension.lean.{axis}", "s^2", 0.0, lean, _entry("lean", k)))
     return found
 
 

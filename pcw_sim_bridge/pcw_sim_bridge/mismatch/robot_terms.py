@@ -110,6 +110,7 @@ class _TermMaker:
             resolution={p.name: _spacing(p, self.looked) for p in effect.nonlinear_parameters if p.default is None},
             repeatable=among > 0,
             grid_size=among,
+            is_exact=True,
         )
 
     def _joint_columns(
@@ -181,9 +182,6 @@ class _TermMaker:
         names = [p.name for p in shown]
         parameters = tuple(_linear(p, neutral[p.name]) for p in shown)
 
-        def secants(shape: Shape, coefficients: FloatArray) -> FloatArray:
-            return self._secants(effect, target, axis, {**shape, **neutral}, parameters, coefficients)
-
         return Term(
             effect=effect.name,
             axis=axis,
@@ -193,7 +191,8 @@ class _TermMaker:
             columns=lambda shape: columns(shape, names),
             arguments=VARIABLES_OF.get(type(effect), ()),
             parameters=parameters,
-            secants=None if isinstance(effect, ClockEffect) else secants,
+            # A shift of noisy samples is no column: see `ClockEffect` in robot_effects.
+            is_exact=not isinstance(effect, ClockEffect),
             resolution=chosen.resolution,
             grid_size=chosen.among,
             once=look in ("windows", "patches"),
@@ -235,25 +234,6 @@ class _TermMaker:
         """Column (T, C) of one parameter of an effect, the others as in `at` or neutral."""
         step, value = _step(effect.parameter(name), neutral[name])
         return self.differences.of_effect(EffectInstance(effect.name, target, {**at, **neutral, name: value}, axis)) / step
-
-    def _secants(
-        self, effect: Effect, target: tuple[str, ...], axis: str | None, neutral: Mapping[str, float],
-        parameters: Sequence[LinearParameter], coefficients: FloatArray,
-    ) -> FloatArray:  # fmt: skip
-        """Columns (T, C, P) that together with the coefficients (P,) give what the effect does there, one after the other."""
-        at = dict(neutral)
-        before = self.differences.of_effect(EffectInstance(effect.name, target, at, axis))
-        columns = []
-        for parameter, coefficient in zip(parameters, coefficients, strict=True):
-            step, _ = _step(effect.parameter(parameter.name), neutral[parameter.name])
-            width = float(np.clip(coefficient, parameter.lower, parameter.upper))
-            width = width if abs(width) > 0.1 * step else step
-            moved = {**at, parameter.name: parameter.value(width)}
-            after = self.differences.of_effect(EffectInstance(effect.name, target, moved, axis))
-            columns.append((after - before) / width)
-            if width == coefficient:
-                at, before = moved, after
-        return np.stack(columns, axis=2)
 
     def _has_rotors(self, target: Sequence[str], axis: str) -> bool:
         """Whether there are motors that a gear could let turn on their own."""
