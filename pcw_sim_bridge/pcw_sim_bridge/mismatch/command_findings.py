@@ -117,8 +117,8 @@ def _proof(problem: RegressionProblem, added: FloatArray, floor: float, rng: np.
     squares = [((values / spread) ** 2) for values in (problem.residual, problem.residual - added)]
     errors = PairedErrors.of(squares[0], squares[1], blocks_of(problem.recording, problem.time), rng)
     before, after = (float(np.sqrt(values[0])) for values in (errors.before, errors.after))
-    intervals = (interval(np.sqrt(draws[:, 0])) for draws in (errors.before_draws, errors.after_draws))
-    return ChannelProof(problem.channels[0].name, floor / spread, before, after, *intervals)
+    first, last = (interval(np.sqrt(draws[:, 0])) for draws in (errors.before_draws, errors.after_draws))
+    return ChannelProof(problem.channels[0].name, floor / spread, before, after, first, last)
 
 
 def _with_instance(named: NamedTerm) -> tuple[NamedTerm, EffectInstance]:

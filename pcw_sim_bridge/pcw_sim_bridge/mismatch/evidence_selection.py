@@ -242,16 +242,21 @@ class EffectSearch:
         """
         instances: tuple[Instance, ...] = ()
         regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
-        self._settle(regression, instances)
+        settled = False
         while len(instances) < self.settings.largest_set:
             step = self.best_addition(regression, instances)
             if step is None or step.gain < self.settings.lenient_gain:
-                break
+                if settled:
+                    break
+                # Only now: the shapes of a grid fit no signal that stands far above its noise.
+                self._settle(regression, instances)
+                settled = True
+                continue
             if sum(i.term == step.instance.term for i in instances) >= self.settings.first_repeats:
                 break
             instances = (*instances, self.refine_shape(regression, instances, step.instance))
             instances = self.improve(regression, instances)
-            self._settle(regression, instances)
+            regression.rescale(self.channel_deviations(regression.unwhitened_residual(regression.fit(instances))))
         return instances
 
     def _settle(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> None:

@@ -143,7 +143,11 @@ class RetunedFinding:
 
 @dataclasses.dataclass(frozen=True)
 class ChannelProof:
-    """Held-out error of one channel over the spread of its measured side, with 95 % intervals; `floor` is its noise."""
+    """Held-out error of one channel over the spread of its measured side, with 95 % intervals.
+
+    Attributes:
+        floor: of its noise, and of what the model misjudges; share: by how far it can be foretold, its weight among others.
+    """
 
     name: str
     floor: float
@@ -151,6 +155,7 @@ class ChannelProof:
     after: float
     before_ci95: Interval
     after_ci95: Interval
+    share: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -138,20 +138,20 @@ def windows(looked: Looked, columns: FloatArray) -> ChosenShapes:
     lengths = np.arange(max(1, round(SHORTEST_PUSH * looked.rate)), min(count // 2, round(LONGEST_PUSH * looked.rate)))
     found: list[tuple[float, int, int]] = []
     tried = 0
-    for length in lengths:
+    for length in lengths.tolist():
         moment, energy = (s[length:] - s[:-length] for s in sums)
         gain = np.sum(moment**2 / np.maximum(energy, 1e-300), axis=1)
         best = int(np.argmax(gain))
         tried += len(gain)
-        found.append((float(gain[best]), best, int(length)))
+        found.append((float(gain[best]), best, length))
     kept: list[tuple[int, int]] = []
-    for _, start, length in sorted(found, reverse=True):
-        if all(start + length <= other or other + more <= start for other, more in kept):
-            kept.append((start, length))
+    for _, start, lasting in sorted(found, reverse=True):
+        if all(start + lasting <= other or other + more <= start for other, more in kept):
+            kept.append((start, lasting))
         if len(kept) == MOST_SHAPES:
             break
     step = 1.0 / looked.rate
-    shapes = tuple({"start": start * step, "duration": length * step} for start, length in kept)
+    shapes = tuple({"start": start * step, "duration": lasting * step} for start, lasting in kept)
     return ChosenShapes(shapes, tried, {"start": ("linear", step), "duration": ("linear", step)})
 
 
@@ -221,10 +221,10 @@ def waves(looked: Looked, climbing: FloatArray) -> ChosenShapes:
     tried = gain.size
     shapes: list[dict[str, float]] = []
     for _ in range(2 * MOST_SHAPES):
-        row, column = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        if gain[row, column] <= 0.0:
+        best, way = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
+        if gain[best, way] <= 0.0:
             break
-        shapes.append({"wavelength": 1.0 / float(numbers[row]), "direction": float(directions[column])})
-        gain[max(0, row - 1) : row + 2, column] = 0.0
+        shapes.append({"wavelength": 1.0 / float(numbers[best]), "direction": float(directions[way])})
+        gain[max(0, best - 1) : best + 2, way] = 0.0
     spacing = 0.5 * math.tau / WAVE_DIRECTIONS
     return ChosenShapes(tuple(shapes), tried, {"wavelength": ("log", 1.12), "direction": ("linear", spacing)})

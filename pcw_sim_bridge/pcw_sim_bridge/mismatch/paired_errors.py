@@ -52,15 +52,16 @@ class PairedErrors:
         """Positions of the quantities with anything to judge."""
         return np.flatnonzero(np.isfinite(self.before))
 
-    def pooled(self) -> PairedErrors:
-        """Return the mean over all quantities that can be judged, as one (1,)."""
+    def pooled(self, weights: FloatArray | None = None) -> PairedErrors:
+        """Return the mean over all quantities that can be judged, as one (1,); weights (K,) of these, None: all alike."""
         own = self.take(self.judged)
+        share = np.ones(len(own.before)) if weights is None else weights[self.judged]
         if not len(own.before):
             nothing = np.full((DRAWS, 1), np.nan)
             return PairedErrors(np.full(1, np.nan), np.full(1, np.nan), nothing, nothing)
         parts = [getattr(own, field.name) for field in dataclasses.fields(own)]
         # A draw may leave out all blocks in which one quantity could be judged.
-        return PairedErrors(*(np.nanmean(part, axis=-1, keepdims=True) for part in parts))
+        return PairedErrors(*(_mean(part, share) for part in parts))
 
     def worse(self) -> FloatArray:
         """By what part the root mean square error has grown (K,), zero where that may be chance (95 %) or it has not."""
@@ -70,6 +71,15 @@ class PairedErrors:
             if np.quantile(change[np.isfinite(change)], 0.025) > 0.0 and self.after[k] > self.before[k]:
                 found[k] = np.sqrt(self.after[k] / max(self.before[k], 1e-300)) - 1.0
         return found
+
+
+def _mean(values: FloatArray, share: FloatArray) -> FloatArray:
+    """Weighted mean of (..., K) over what is there, (..., 1)."""
+    there = np.isfinite(values)
+    total = np.sum(np.where(there, values * share, 0.0), axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean: FloatArray = total / np.sum(there * share, axis=-1, keepdims=True)
+    return mean
 
 
 def interval(draws: FloatArray) -> Pair:

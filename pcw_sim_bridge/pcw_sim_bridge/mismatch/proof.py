@@ -273,7 +273,9 @@ class Prover:
         relative = PairedErrors.of(
             before / floors**2, left / floors**2, blocks_of(problem.recording, problem.time), self.rng
         ).pooled()
-        pooled, floor = inverse.pooled(), float(np.sqrt(np.mean(floors[judged] ** 2))) if len(judged) else 0.0
+        weights = (np.maximum(explanation.floor, 1e-300) / _floors(explanation, problem)) ** 2
+        pooled = inverse.pooled(weights)
+        floor = float(np.sqrt(np.average(floors[judged] ** 2, weights=weights[judged]))) if len(judged) else 0.0
         worse = {problem.channels[k].name: float(inverse.worse()[k]) for k in judged}
         for recording in np.unique(problem.recording):
             rows = problem.recording == recording
@@ -295,7 +297,8 @@ class Prover:
             inverse_ci95=(interval(np.sqrt(pooled.before_draws[:, 0])), interval(np.sqrt(pooled.after_draws[:, 0]))),
             inverse_floor=floor,
             channels=tuple(
-                ChannelProof(problem.channels[k].name, float(floors[k]), *_both(inverse, k)) for k in judged
+                ChannelProof(problem.channels[k].name, float(floors[k]), *_both(inverse, k), share=float(weights[k]))
+                for k in judged
             ),
             rollouts=rollouts,
             rollout_gap_closed=rollout_gap,
@@ -345,14 +348,15 @@ def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFindi
         return finding
     channels = (*finding.channels, *more)
 
-    def together(values: Sequence[float]) -> float:
-        return float(np.sqrt(np.mean(np.square(values))))
+    share = [c.share for c in channels]
 
-    before, after = together([c.before for c in channels]), together([c.after for c in channels])
-    floor = together([c.floor for c in channels])
+    def together(values: Sequence[float], weights: Sequence[float] | None = None) -> float:
+        return float(np.sqrt(np.average(np.square(values), weights=weights)))
+
+    before, after, floor = (together([getattr(c, name) for c in channels], share) for name in ("before", "after", "floor"))
+    finite = [c for c in channels if math.isfinite(c.floor)]
     first, last = (
-        together([getattr(c, name) / max(c.floor, 1e-300) for c in channels if math.isfinite(c.floor)])
-        for name in ("before", "after")
+        together([getattr(c, name) / max(c.floor, 1e-300) for c in finite]) for name in ("before", "after")
     )
     worst = max(more, key=lambda c: c.after / max(c.before, 1e-300))
     grown = worst.after / max(worst.before, 1e-300) - 1.0 if worst.after_ci95[0] > worst.before_ci95[1] else 0.0

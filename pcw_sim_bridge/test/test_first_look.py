@@ -1,0 +1,116 @@
+"""Where and when something is at work that can be in too many places to be tried one by one."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pcw_control.excitation import make_excitation
+from pcw_description import load_robot
+from pcw_description.effects.registry import read_physics
+from pcw_description.recording import Recording
+from pcw_sim_bridge.mismatch.analysis import analyse
+from pcw_sim_bridge.mismatch.first_look import Looked, patches, waves, windows
+from pcw_sim_bridge.mismatch.regression_problem import EffectSize
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.simulated_run import record_run
+
+THESIS = load_robot("thesis")
+RATE = 20.0
+
+
+def looked(left: np.ndarray, seed: int = 0) -> Looked:
+    """Return a residual as seen along a winding path of four wheels over a few square metres."""
+    count = len(left)
+    time = np.arange(count) / RATE
+    centre = np.stack([1.5 * np.sin(0.31 * time), 1.2 * np.sin(0.43 * time + 1.0)], axis=1)
+    corners = 0.2 * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+    heading = np.arctan2(np.gradient(centre[:, 1]), np.gradient(centre[:, 0]))
+    noisy = left + np.random.default_rng(seed).standard_normal(left.shape)
+    return Looked(
+        left=noisy, deviation=np.ones(left.shape[1]), valid=np.ones(left.shape, dtype=bool), time=time, rate=RATE,
+        angle=np.zeros((count, 4, 2)), places=centre[:, None] + corners, heading=np.repeat(heading[:, None], 4, axis=1),
+    )
+
+
+def test_the_time_of_a_push_is_found() -> None:
+    left = np.zeros((800, 2))
+    left[246:280] = [2.0, -1.0]
+    columns = np.zeros((800, 2, 2))
+    columns[:, 0, 0] = columns[:, 1, 1] = 1.0
+    found = windows(looked(left), columns)
+    assert found.shapes[0]["start"] == pytest.approx(246 / RATE, abs=0.1)
+    assert found.shapes[0]["duration"] == pytest.approx(34 / RATE, abs=0.15)
+    assert found.among > 10_000, "a choice among so many is paid for"
+
+
+def test_the_place_of_a_patch_is_found() -> None:
+    view = looked(np.zeros((1200, 4)))
+    inside = np.linalg.norm(view.places - [0.6, -0.4], axis=2) < 0.3
+    view = looked(3.0 * inside)
+    columns = np.zeros((1200, 4, 4))
+    columns[:, range(4), range(4)] = 1.0
+    best = patches(view, columns).shapes[0]
+    assert np.hypot(best["x"] - 0.6, best["y"] + 0.4) < 0.15
+    assert best["length"] == pytest.approx(0.6, rel=0.5)
+
+
+def test_length_and_direction_of_waves_are_found() -> None:
+    view = looked(np.zeros((1200, 4)))
+    k, direction = 2.0 * np.pi / 0.8, 0.5
+    c, s = np.cos(direction), np.sin(direction)
+    along = k * (c * view.places[..., 0] + s * view.places[..., 1])
+    across = k * (-s * view.places[..., 0] + c * view.places[..., 1])
+    slope = np.cos(along) * np.cos(across) * np.cos(view.heading - direction)
+    slope -= np.sin(along) * np.sin(across) * np.sin(view.heading - direction)
+    columns = np.zeros((1200, 4, 4))
+    columns[:, range(4), range(4)] = 1.0
+    best = waves(looked(2.0 * slope), columns).shapes[0]
+    assert best["wavelength"] == pytest.approx(0.8, rel=0.05)
+    assert best["direction"] == pytest.approx(direction, abs=0.15)
+
+
+CASTERS = list(THESIS.caster_names)
+CONCEALED = [
+    {"name": "external_push", "target": ["chassis"], "force_x": 20.0, "force_y": -8.0, "start": 12.3, "duration": 1.5},
+    {"name": "low_friction_patch", "target": CASTERS, "factor": 0.3, "x": 0.5, "y": 0.3, "length": 0.6, "width": 0.4},
+]
+
+
+@pytest.mark.parametrize("entry", CONCEALED, ids=lambda entry: str(entry["name"]))
+def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object], tmp_path: Path) -> None:
+    excitation = make_excitation("identification", THESIS, None, 11)
+    true = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
+    record_run(true, excitation.twist, excitation.duration, 11, tmp_path / "run", "reduced", controlled_as=THESIS)
+    findings = analyse(RobotSubject(THESIS), [tmp_path / "run"], [], {}, 0, lambda message: None).findings
+    [effect] = findings.effects
+    assert effect.name == entry["name"] and effect.probability > 0.95
+    values = {name: parameter.value for name, parameter in effect.parameters.items()}
+    if effect.name == "external_push":
+        assert values["start"] == pytest.approx(12.3, abs=0.1)
+        assert (values["force_x"], values["force_y"]) == pytest.approx((20.0, -8.0), rel=0.05)
+    else:
+        assert np.hypot(values["x"] - 0.5, values["y"] - 0.3) < 0.15
+        assert values["factor"] == pytest.approx(0.3, rel=0.2)
+
+
+def test_a_problem_is_exact_where_it_is_made_so(tmp_path: Path) -> None:
+    """A wrong zero is no first-order matter at 0.05 rad; at its size the model leaves what a healthy robot does."""
+    left = []
+    for offset in (0.0, 0.05):
+        entry = {"name": "steer_zero_offset", "target": ["front_left"], "offset": offset}
+        true = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
+        excitation = make_excitation("identification", THESIS, 12.0, 3)
+        record_run(true, excitation.twist, 12.0, 3, tmp_path / str(offset), "reduced", controlled_as=THESIS)
+        problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / str(offset), THESIS)]).build()
+        number = next(k for k, term in enumerate(problem.terms) if term.key == "steer_zero_offset/front_left")
+        column = problem.columns(number, ())[:, :, 0]
+        exact = problem.exact_at({}, [EffectSize(number, (), np.array([offset]))])
+        assert np.array_equal(exact.nominal_residual, problem.residual)
+        slip = [k for k, channel in enumerate(problem.channels) if channel.name.startswith("rolling")]
+        rows = problem.valid[:, slip].all(axis=1)
+        left += [float(np.std((p.residual - offset * column)[np.ix_(rows, slip)])) for p in (problem, exact)]
+    healthy, _, first_order, exactly = left
+    assert exactly < 1.5 * healthy < first_order
