@@ -22,14 +22,17 @@ EFFECT = ActuatorEffect(
     target_kind="caster",
     axis="drive",
     summary="The motor gives no more than its current limit, and less at speed, where its back-EMF uses up the voltage.",
-    sentence=(
-        "The {joint} of {target} gives at most {torque:.3g} N m, less above {knee_speed:.3g} rad/s and nothing from "
-        "{no_load_speed:.3g} rad/s on."
-    ),
+    sentence="The {joint} of {target} gives at most {torque:.3g} N m.",
     parameters=(
         EffectParameter("torque", "N m", "largest torque, joint side", 0.0, 1e5, 5.0),
-        EffectParameter("knee_speed", "rad/s", "joint speed up to which it is there", 0.0, 1e4, 10.0, default=1e4),
-        EffectParameter("no_load_speed", "rad/s", "joint speed at which nothing is left", 0.0, 1e5, 20.0, default=1e5),
+        EffectParameter(
+            "knee_speed", "rad/s", "joint speed up to which it is there", 0.0, 1e4, 10.0, default=1e4,
+            clause=", less above {knee_speed:.3g} rad/s",
+        ),
+        EffectParameter(
+            "no_load_speed", "rad/s", "joint speed at which nothing is left", 0.0, 1e5, 20.0, default=1e5,
+            clause=", and nothing from {no_load_speed:.3g} rad/s on",
+        ),
     ),
     sensors=("joint_states", "joint_commands"),
     look_alikes=("torque_constant_error", "actuator_lag"),

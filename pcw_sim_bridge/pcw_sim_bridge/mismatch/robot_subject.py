@@ -120,7 +120,7 @@ class RobotSubject:
 
     def statement(self, instance: EffectInstance) -> str:
         """Return the plain sentence of an effect."""
-        return get(instance.name).statement(instance.target, instance.parameters)
+        return get(instance.name).statement(instance.target, instance.parameters, instance.axis)
 
     def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> RobotSubject:
         """Return the robot with effects added and its numbers re-tuned; those of its readings have no place in it."""
