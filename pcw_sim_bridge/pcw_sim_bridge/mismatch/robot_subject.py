@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,14 @@ import numpy as np
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
-from pcw_description.robot_description import DRIVE, STEER, Caster, RobotDescription
+from pcw_description.robot_description import (
+    AXIS_NAMES,
+    DRIVE,
+    STEER,
+    Caster,
+    ContactDescription,
+    RobotDescription,
+)
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
 from ..plants.true_robot import as_it_really_is
@@ -27,6 +35,7 @@ from .rolling_model import ModelNumbers, twists
 from .rollout import Windows
 from .subject import Opened
 
+LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
 
 
@@ -220,9 +229,9 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
     com = (x + retuned.get("chassis.com.x", 0.0), y + retuned.get("chassis.com.y", 0.0), z)
     chassis = dataclasses.replace(
         chassis,
-        mass=retuned.get("chassis.mass", chassis.mass),
+        mass=_positive(retuned.get("chassis.mass", chassis.mass), chassis.mass),
         com=com,
-        inertia_zz=retuned.get("chassis.inertia_zz", chassis.inertia_zz),
+        inertia_zz=_positive(retuned.get("chassis.inertia_zz", chassis.inertia_zz), chassis.inertia_zz),
     )
     first = robot.casters[0]
     # Numbers of a kind are re-tuned together: what is stated of the first caster, in proportion for all.
@@ -233,14 +242,20 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
         "rotors.drive": float(robot.armature[0, DRIVE, DRIVE]),
         "rotors.steer": float(robot.armature[0, STEER, STEER]),
     }
-    scale = {name: retuned.get(name, value) / value if value > 0.0 else 1.0 for name, value in stated.items()}
+    scale = {
+        name: _positive(retuned.get(name, value), value) / value if value > 0.0 else 1.0 for name, value in stated.items()
+    }
 
     def caster(old: Caster) -> Caster:
-        x, y = old.caster_offset
+        def moved(key: str, place: tuple[float, float]) -> tuple[float, float]:
+            x, y = (retuned.get(f"{key}.{axis}/{old.name}", 0.0) for axis in "xy")
+            return place[0] + x, place[1] + y
+
         return dataclasses.replace(
             old,
-            caster_offset=(x + retuned.get(f"caster_offset.x/{old.name}", 0.0), y),
-            wheel_radius=retuned.get(f"wheel_radius/{old.name}", old.wheel_radius),
+            caster_offset=moved("caster_offset", old.caster_offset),
+            steer_axis=moved("steer_axis", old.steer_axis),
+            wheel_radius=_positive(retuned.get(f"wheel_radius/{old.name}", old.wheel_radius), old.wheel_radius),
             module=dataclasses.replace(
                 old.module,
                 mass=old.module.mass * scale["module.mass"],
@@ -254,12 +269,32 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
             ),
         )
 
-    contact, softness = robot.contact, retuned.get("contact.stiffness", 1.0)
-    contact = dataclasses.replace(
-        contact,
-        lambda_p=contact.lambda_p * softness,
-        lateral=dataclasses.replace(contact.lateral, lambda_p=contact.lateral.lambda_p * softness),
-    )
-    return dataclasses.replace(
-        robot, chassis=chassis, casters=tuple(caster(old) for old in robot.casters), contact=contact
-    )
+    robot = dataclasses.replace(robot, chassis=chassis, casters=tuple(caster(old) for old in robot.casters))
+    return _with_tyres(robot, retuned)
+
+
+def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotDescription:
+    """Return the robot with tyres that give more or less, each by what all share and by its own."""
+    if not any(name.startswith("contact.") for name in retuned):
+        return robot
+    common = retuned.get("contact.stiffness", 1.0)
+    length = retuned.get("contact.relaxation_length")
+
+    def tyre(caster: str, old: ContactDescription) -> ContactDescription:
+        along, across = (
+            max(common + retuned.get(f"contact.stiffness/{caster}_{axis}", 1.0) - 1.0, LEAST_PART) for axis in AXIS_NAMES
+        )
+        lateral = dataclasses.replace(old.lateral, lambda_p=min(old.lateral.lambda_p * across, 1.0))
+        relaxation = old.relaxation_length if length is None else _positive(length, old.relaxation_length)
+        return dataclasses.replace(
+            old, lambda_p=min(old.lambda_p * along, 1.0), lateral=lateral, relaxation_length=min(relaxation, 1.0)
+        )
+
+    for name in robot.caster_names:
+        robot = robot.with_tyres([name], functools.partial(tyre, name))
+    return robot
+
+
+def _positive(value: float, nominal: float) -> float:
+    """The value, or where a fit ran off to what no robot is, a small part of the nominal one."""
+    return max(value, LEAST_PART * nominal)
