@@ -27,6 +27,7 @@ from .rollout import HORIZONS, MAIN_HORIZON, RAN_AWAY, Windows
 from .subject import Opened, Subject
 from .whitened_regression import Instance
 
+HEALTHY = 3.0  # tolerances
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
 LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
@@ -230,10 +231,12 @@ class Prover:
             parameters = [term.parameters[k] for k in instance.active]
             found = {p.name: p.value(float(value)) for p, value in zip(parameters, values, strict=True) if not p.hidden}
             effects.append(effect_instance(term.effect, term.target, dict(instance.shape) | found, term.axis))
+        # In place of an effect no number is stretched further than that of a healthy robot.
+        widest = np.inf if without is None else HEALTHY
         numbers = {
-            nuisance.name: nuisance.nominal + float(change)
-            for nuisance, change in zip(problem.nuisances, mean, strict=False)
-            if nuisance.name in retuned
+            n.name: n.nominal + float(np.clip(change, -widest * n.deviation, widest * n.deviation))
+            for n, change in zip(problem.nuisances, mean, strict=False)
+            if n.name in retuned
         }
         return self.subject.patched(effects, numbers)
 
