@@ -275,7 +275,7 @@ CONTRACT = {
             "rollout_gap_closed": {"?": NUMBER},
             "harm": NUMBER,
             "harm_at": {"?": TEXT},
-            "per_channel": [{"name": TEXT, **ERRORS}],
+            "per_channel": [{"name": TEXT, "share": NUMBER, **ERRORS}],
             "horizons": [{"signal": TEXT, "horizon_s": NUMBER, **ERRORS}],
         }
     },
