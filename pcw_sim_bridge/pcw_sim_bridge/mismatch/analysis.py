@@ -105,7 +105,8 @@ def analyse(
     everything = [*((named, _instance(named)) for named in explanation.named), *commands.named]
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
-    patched = subject.patched(instances, _reported_numbers(explanation)) if instances else subject
+    numbers = _reported_numbers(explanation) if proof.tuned else {}
+    patched = subject.patched(instances, numbers) if instances else subject
     leftovers = (*explanation.leftovers, *commands.leftovers)
     verdict = {
         (True, False): "explained",
@@ -254,7 +255,8 @@ def _traces(problem: RegressionProblem, explained: FloatArray, fit: Fit, role: s
         traces.append(
             Trace(
                 channel.name, channel.unit, role, time_on_end, problem.measured[:, c] * blank, nominal * blank,
-                (nominal + explained[:, c]) * blank, variable, problem.variables[variable],
+                (problem.measured[:, c] - problem.residual[:, c] + explained[:, c]) * blank,
+                variable, problem.variables[variable],
             )
         )
     return tuple(traces)

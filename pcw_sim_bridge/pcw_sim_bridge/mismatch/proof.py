@@ -45,7 +45,8 @@ class Proof:
     Attributes:
         explanation: with the effects that stay.
         finding: errors before and after.
-        held_out: what was judged; predicted: what the fits add to the nominal prediction of it (T, C).
+        held_out: what was judged; predicted: what the fits take of its residual (T, C).
+        tuned: whether re-tuned numbers go into the patch beside the effects.
         dropped: ladder lines of the effects that do not help.
         notes: what a reader has to know of the proof.
     """
@@ -54,6 +55,7 @@ class Proof:
     finding: FitFinding
     held_out: HeldOut
     predicted: FloatArray
+    tuned: bool
     dropped: tuple[LadderFinding, ...]
     notes: tuple[str, ...]
 
@@ -99,6 +101,8 @@ class Prover:
         if self.windows is not None and not len(self.windows.begin):
             self.windows = None
         self.before = None if self.windows is None else subject.rollout(self.windows)
+        # Whether numbers of the description that were re-tuned go into the patch, too.
+        self.tuned = True
 
     def prove(self, explanation: Explanation) -> Proof:
         """Drop what does not help, and hold the rest against the data.
@@ -123,12 +127,36 @@ class Prover:
             notes.append(f"{label} was fitted but did not help held out: {reason}. It is not proposed.")
             kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
             explanation = self.reduce(explanation, kept)
+        predicted = held_out.problem.residual - held_out.problem.nominal_residual
+        if explanation.named:
+            means = held_out.means()
+            bare = means.copy()
+            bare[:, : held_out.nuisances] = 0.0
+            predictions = [held_out.predicted(numbers) for numbers in (means, bare)]
+            errors = [self._error(explanation, held_out, prediction) for prediction in predictions]
+            self.tuned = errors[0] <= errors[1]
+            predicted = predictions[0 if self.tuned else 1]
+            if not self.tuned:
+                after = self._rollout(explanation, held_out)
+                notes.append(
+                    "The description's numbers as re-tuned beside the effects do not help held out: in the patch they stay."
+                )
         notes += self._remarks(explanation, held_out, after)
-        nothing = not explanation.named
-        unchanged = held_out.problem.residual - held_out.problem.nominal_residual
-        predicted = unchanged if nothing else held_out.predicted(held_out.means())
         finding = self._finding(explanation, held_out, predicted, after)
-        return Proof(explanation, finding, held_out, predicted, tuple(dropped), tuple(notes))
+        return Proof(explanation, finding, held_out, predicted, self.tuned, tuple(dropped), tuple(notes))
+
+    def _numbers(self, explanation: Explanation) -> Mapping[str, float]:
+        """Numbers of the description that go into the patch."""
+        return self.retune(explanation) if self.tuned else {}
+
+    def _error(self, explanation: Explanation, held_out: HeldOut, predicted: FloatArray) -> float:
+        """Mean squared relative error of all channels, each counted by how far it can be foretold."""
+        problem = held_out.problem
+        blank = np.where(problem.valid, 1.0, np.nan)
+        squares = ((problem.residual - predicted) * blank / _spread(problem)) ** 2
+        counts = np.isfinite(squares).sum(axis=0)
+        weights = np.where(counts > 0, _shares(explanation, problem), 0.0)
+        return float(np.nansum(np.nansum(squares, axis=0) / np.maximum(counts, 1) * weights) / max(weights.sum(), 1e-300))
 
     # -- what is judged ---------------------------------------------------------------------------------------------
 
@@ -205,7 +233,7 @@ class Prover:
             return self.before
         fold = _fold_of(held_out, self.windows)
         after = np.full_like(self.before, np.nan)
-        retuned = self.retune(explanation)
+        retuned = self._numbers(explanation)
         for number, mean in enumerate(held_out.means(without)):
             own = fold == number
             if own.any():
@@ -276,7 +304,7 @@ class Prover:
         relative = PairedErrors.of(
             before / floors**2, left / floors**2, blocks_of(problem.recording, problem.time), self.rng
         ).pooled()
-        weights = (np.maximum(explanation.floor, 1e-300) / _floors(explanation, problem)) ** 2
+        weights = _shares(explanation, problem)
         pooled = inverse.pooled(weights)
         floor = float(np.sqrt(np.average(floors[judged] ** 2, weights=weights[judged]))) if len(judged) else 0.0
         worse = {problem.channels[k].name: float(inverse.worse()[k]) for k in judged}
@@ -316,7 +344,7 @@ class Prover:
         windows = self._quiet_windows(explanation)
         if windows is None or self.before is None or after is None:
             return (), None
-        retuned = self.retune(explanation)
+        retuned = self._numbers(explanation)
         model = self._patched(explanation.search.problem, held_out, held_out.means().mean(axis=0), retuned, None)
         noise = windows.relative((model if held_out.proposed else self.subject).rollout_floor(windows, self.rng))
         counts = np.maximum(np.isfinite(noise).sum(axis=0), 1)
@@ -343,6 +371,12 @@ def _floors(explanation: Explanation, problem: RegressionProblem) -> FloatArray:
     squares = np.where(problem.valid, problem.misjudged**2, 0.0).sum(axis=0) / np.maximum(problem.valid.sum(axis=0), 1)
     result: FloatArray = np.hypot(floors, np.sqrt(squares))
     return result
+
+
+def _shares(explanation: Explanation, problem: RegressionProblem) -> FloatArray:
+    """Weights of the channels (C,): how much of what they leave in any case is noise, and not the model's own."""
+    shares: FloatArray = (np.maximum(explanation.floor, 1e-300) / _floors(explanation, problem)) ** 2
+    return shares
 
 
 def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFinding:
