@@ -29,6 +29,7 @@ KEY_OF_MODULE = {
     "PIL": "python3-pil",
     "can": "python3-can",
     "jinja2": "python3-jinja2",
+    "markupsafe": "python3-markupsafe",
     "lz4": "mcap-ros2-support",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",

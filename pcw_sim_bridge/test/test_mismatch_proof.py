@@ -156,7 +156,7 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
     assert robot.casters[1].wheel_radius == 0.0751
     assert robot.casters[1].caster_offset[0] == pytest.approx(caster.caster_offset[0] - 1e-3)
     assert robot.casters[3].module.mass == pytest.approx(1.1 * THESIS.casters[3].module.mass)
-    assert robot.contact.lambda_p == pytest.approx(1.2 * THESIS.contact.lambda_p)
+    assert [tyre.lambda_p for tyre in robot.tyres] == pytest.approx([1.2 * tyre.lambda_p for tyre in THESIS.tyres])
     assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
 
 
