@@ -51,7 +51,7 @@ class SelectionSettings:
     Attributes:
         false_alarm_rate: share of recordings with nothing missing in which something may be named.
         lenient_gain: nats to enter the first, over-complete model.
-        smallest_threshold: nats below which nothing is named however quiet the surrogates are (odds of 160000 to 1): evidence
+        smallest_threshold: nats below which nothing is named however quiet the surrogates are (odds of 8000 to 1): evidence
             takes the model for exact, and many small errors of it look like small effects.
         smallest_share: a term must move some channel by at least this part of the rms that remains there. Below it lie
             the details that no model of a real machine gets right, and they repeat as faithfully as an effect does.
@@ -63,7 +63,7 @@ class SelectionSettings:
 
     false_alarm_rate: float = 0.005
     lenient_gain: float = 2.0
-    smallest_threshold: float = 12.0
+    smallest_threshold: float = 9.0
     smallest_share: float = 0.25
     smallest_part: float = 0.02
     blocks: int = 10
