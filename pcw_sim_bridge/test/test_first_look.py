@@ -12,7 +12,7 @@ from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.first_look import Looked, patches, waves, windows
-from pcw_sim_bridge.mismatch.regression_problem import EffectSize
+from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
@@ -107,7 +107,7 @@ def test_a_problem_is_exact_where_it_is_made_so(tmp_path: Path) -> None:
         problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / str(offset), THESIS)]).build()
         number = next(k for k, term in enumerate(problem.terms) if term.key == "steer_zero_offset/front_left")
         column = problem.columns(number, ())[:, :, 0]
-        exact = problem.exact_at({}, [EffectSize(number, (), np.array([offset]))])
+        exact = problem.exact_at({}, [SizedTerm(number, (), np.array([offset]))])
         assert np.array_equal(exact.nominal_residual, problem.residual)
         slip = [k for k, channel in enumerate(problem.channels) if channel.name.startswith("rolling")]
         rows = problem.valid[:, slip].all(axis=1)

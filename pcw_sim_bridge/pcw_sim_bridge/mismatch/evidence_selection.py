@@ -16,20 +16,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .noise_model import (
-    SLOW_ORDINATES,
-    NoiseModel,
-    fit_noise_model,
-    huber_weights,
-    robust_deviation,
-    white_noise_model,
-)
+from .noise_model import SLOW_ORDINATES, fit_noise_model, huber_weights, robust_deviation, white_noise_model
 from .regression_problem import (
     BoolArray,
-    EffectSize,
     FloatArray,
     IntArray,
     RegressionProblem,
+    SizedTerm,
     contiguous_blocks,
     segment_slices,
 )
@@ -142,8 +135,7 @@ class EffectSearch:
         threshold = self.calibrate(regression, instances)
         selection = self.prune(regression, instances, threshold)
         chosen = self.made_exact(selection.fit.instances)
-        selection = self.prune(self.whiten_at(self.residual_of(chosen)), chosen, threshold)
-        return selection
+        return self.prune(self.whiten_at(self.residual_of(chosen)), chosen, threshold)
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
         """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.
@@ -151,7 +143,8 @@ class EffectSearch:
         What their first order leaves would pass for other effects.
         """
         for count in range(EXACT_ROUNDS):
-            problem, residual = self.problem, self.residual_of(instances)
+            before = self.problem, self._point
+            residual = self.residual_of(instances)
             if not self._exact_at(self.whiten_at(residual).fit(instances)):
                 break
             regression = self.whiten_at(residual)
@@ -161,7 +154,7 @@ class EffectSearch:
                     others = (*again[:index], *again[index + 1 :])
                     again = (*again[:index], self.refine_shape(regression, others, instance), *again[index + 1 :])
             if self._error(self.residual_of(again), residual) > self._error(residual, residual):
-                self.problem = problem
+                self.problem, self._point = before
                 break
             instances = again
         return instances
@@ -180,7 +173,7 @@ class EffectSearch:
             bounds = [(term.parameters[k].lower, term.parameters[k].upper) for k in instance.active]
             coefficients[list(instance.active)] = [float(np.clip(f, *b)) for f, b in zip(found, bounds, strict=True)]
             flat += list(found)
-            sizes.append(EffectSize(instance.term, instance.shape, coefficients))
+            sizes.append(SizedTerm(instance.term, instance.shape, coefficients))
             position += len(instance.active)
         point = (tuple((i.term, i.shape) for i in fit.instances), np.array(flat))
         before, self._point = self._point, point
@@ -204,11 +197,6 @@ class EffectSearch:
 
     def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
         """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
-        noise, weights = self._noise_of(residual, white, by_channel)
-        return WhitenedRegression(self.problem, noise, weights, None if by_channel else self.block)
-
-    def _noise_of(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> tuple[NoiseModel, FloatArray]:
-        """Noise model of a residual (T, C) and the weights of its samples (T, C)."""
         problem = self.problem
         if white:
             noise = white_noise_model(residual, problem.valid)
@@ -223,7 +211,7 @@ class EffectSearch:
             weights[:, channel] = problem.channels[channel].information * robust
             if problem.misjudged is not None:
                 weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
-        return noise, weights
+        return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)
 
     def residual_of(self, instances: Sequence[Instance]) -> FloatArray:
         """Residual (T, C) of the least-squares fit of a set, with robust weights."""

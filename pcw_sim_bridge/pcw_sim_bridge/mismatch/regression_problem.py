@@ -147,7 +147,7 @@ class Term:
 
 
 @dataclasses.dataclass(frozen=True)
-class EffectSize:
+class SizedTerm:
     """A term of a problem at work: with a shape, and with coefficients of all its parameters (P,)."""
 
     term: int
@@ -160,7 +160,7 @@ class Point:
     """Where a problem is exact: changes of nuisances, by name, and sizes of effects."""
 
     changes: Mapping[str, float]
-    sizes: tuple[EffectSize, ...]
+    sizes: tuple[SizedTerm, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +218,7 @@ class RegressionProblem:
     misjudged: FloatArray | None = None
     scale_deviation: float = 0.0
     sites: Sites | None = None
-    exact: Callable[[Mapping[str, float], Sequence[EffectSize]], tuple[FloatArray, Sequence[str]] | None] | None = None
+    exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
     nominal: FloatArray | None = None
     point: Point | None = None
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
@@ -255,7 +255,7 @@ class RegressionProblem:
         wider._remembered.update(self._remembered)
         return wider
 
-    def exact_at(self, changes: Mapping[str, float], sizes: Sequence[EffectSize]) -> RegressionProblem:
+    def exact_at(self, changes: Mapping[str, float], sizes: Sequence[SizedTerm]) -> RegressionProblem:
         """Return the problem with a residual that the columns explain exactly where numbers and effects are of these sizes.
 
         Columns are derivatives at the description. To the residual of the model there, r(x), is added what the columns take:

@@ -23,7 +23,7 @@ from .channel_differences import ChannelDifferences
 from .errors import MismatchError
 from .first_look import Looked, remainder
 from .found_effect import effect_instance
-from .regression_problem import BoolArray, Channel, EffectSize, FloatArray, RegressionProblem, Sites, Term
+from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, SizedTerm, Term
 from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
 from .robot_nuisances import robot_nuisances, varied_numbers
@@ -128,7 +128,7 @@ class RobotProblemBuilder:
         )
 
     def _exact(
-        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[EffectSize]
+        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
     ) -> tuple[FloatArray, Sequence[str]] | None:
         """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be."""
         instances = []
