@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
@@ -17,7 +16,7 @@ from std_srvs.srv import SetBool
 
 from pcw_control.excitation import EXCITATIONS, read_excitation
 from pcw_description.errors import PcwError
-from pcw_description.nodes.node_tools import COMMAND_SOURCE, SENSOR, declare, run_node, stamp_to_ns
+from pcw_description.nodes.node_tools import COMMAND_SOURCE, SENSOR, declare, run_node, stamp_to_ns, wait_until_heard
 from pcw_description.robot_file import load_robot
 
 # What has to be heard by a node of `wait_for` before the simulation starts, if the node listens to it at all.
@@ -106,10 +105,10 @@ class ManoeuvreNode(Node):
 
     def close(self) -> None:
         """Leave the robot with a command to stand, once it has arrived."""
-        if self._phase == "driving":
+        if self._start_ns is not None and not self.finished:  # it may drive before the bridge's answer has been seen
             self._command.twist = Twist()
             self._cmd_vel.publish(self._command)
-            self._cmd_vel.wait_for_all_acked(Duration(seconds=0.2))  # else it is lost now and then as the node goes
+            wait_until_heard(self._cmd_vel)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
@@ -27,6 +26,7 @@ from pcw_description.nodes.node_tools import (
     joint_state_arrays,
     run_node,
     stamp_to_ns,
+    wait_until_heard,
 )
 
 from ..computed_torque import ComputedTorque, ComputedTorqueMeasurement, TwistReference, initial_state
@@ -158,7 +158,7 @@ class ComputedTorqueNode(LifecycleNode):
         self._active = False
         if hasattr(self, "_commands"):
             self._send_zero()
-            self._commands.wait_for_all_acked(Duration(seconds=0.2))
+            wait_until_heard(self._commands)
 
     # --- References -------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ A node's file needs no more than this:
 
         def close(self) -> None:               # optional: last words while publishing still works
             self._commands.publish(zero_torque)
+            wait_until_heard(self._commands)
 
     def main(args: list[str] | None = None) -> int:
         return run_node(OdometryNode, args)
@@ -32,10 +33,12 @@ import rclpy
 from builtin_interfaces.msg import Time
 from numpy.typing import ArrayLike
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
@@ -50,6 +53,7 @@ except ImportError:  # older Jazzy patch releases do not have it
 NANOSECONDS = 1_000_000_000
 # A signal that arrives while the executor sleeps is seen when it wakes, so this is the latency of a shutdown.
 SPIN_TIMEOUT = 0.1  # [s]
+LAST_WORDS = 1.0  # the longest that a node which ends waits for its listeners to hear them [s]
 
 
 # --- Running --------------------------------------------------------------------------------------------
@@ -151,6 +155,11 @@ def _close(node: Node) -> int:
         traceback.print_exc()
         return 1
     return 0
+
+
+def wait_until_heard(publisher: Publisher) -> None:
+    """Wait until all reliable listeners have what was published last, else it is lost now and then as the node goes."""
+    publisher.wait_for_all_acked(Duration(seconds=LAST_WORDS))
 
 
 def _program_name() -> str:
