@@ -44,7 +44,8 @@ def compiled(function: Function) -> Function:
         return function
     # What was typed into an interpreter has no file, and the cache no place.
     in_file = Path(function.__code__.co_filename).is_file()
-    dispatcher = numba.njit(cache=in_file, error_model="numpy")(function)
+    # No kernel holds Python objects, so several may run at once in threads.
+    dispatcher = numba.njit(cache=in_file, error_model="numpy", nogil=True)(function)
     _depend_on_all_kernels(dispatcher, function.__module__)
     return dispatcher  # type: ignore[no-any-return]
 

@@ -17,7 +17,7 @@ from pcw_description.urdf import robot_urdf
 rclpy = pytest.importorskip("rclpy")
 
 # A domain of its own keeps other tests on this machine out.
-ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "71"}
+ENVIRONMENT = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "19"}
 COMMAND = [sys.executable, "-m", "pcw_description.nodes.robot_description", "--ros-args"]
 # First contact over DDS takes 1 to 3 s on a free machine.
 DEADLINE = 30.0

@@ -28,6 +28,7 @@ class EffectParameter:
         default: used when the description leaves the parameter out; None if it must be given.
         linear: the contribution is proportional to this parameter (all linear parameters together are additive).
         near_linear: it is so near zero, where the effect vanishes with it; its derivative there tells how the effect shows.
+        squared: its square is so.
         reciprocal: its inverse is so: the effect vanishes as the parameter grows.
         neutral: where the effect vanishes, if not at zero or without bound: a number, or where in the description it
             stands, as "contact.relaxation_length".
@@ -43,6 +44,7 @@ class EffectParameter:
     default: float | None = None
     linear: bool = False
     near_linear: bool = False
+    squared: bool = False
     reciprocal: bool = False
     neutral: str | float = ""
     clause: str = ""
@@ -94,7 +96,7 @@ class Effect:
     @property
     def searched_parameters(self) -> tuple[EffectParameter, ...]:
         """The parameters whose size, beginning at none, a derivative can find."""
-        return tuple(p for p in self.parameters if p.linear or p.near_linear or p.reciprocal)
+        return tuple(p for p in self.parameters if p.linear or p.near_linear or p.squared or p.reciprocal)
 
     @property
     def nonlinear_parameters(self) -> tuple[EffectParameter, ...]:

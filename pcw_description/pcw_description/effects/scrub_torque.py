@@ -22,7 +22,7 @@ EFFECT = DescriptionEffect(
     summary="The contact patch resists turning about the vertical, most of all on the spot.",
     sentence="A contact patch with {radius:.3g} m more scrub radius under {target}.",
     parameters=(
-        EffectParameter("radius", "m", "what the effective radius of the patch is more", 0.0, 0.1, 5e-3, near_linear=True),
+        EffectParameter("radius", "m", "what the effective radius of the patch is more", 0.0, 0.1, 5e-3, squared=True),
     ),
     sensors=("joint_states",),
     look_alikes=("steer_coulomb_friction", "steer_viscous_friction"),

@@ -33,6 +33,7 @@ from .node_tools import EventsExecutor
 
 # First contact takes seconds on a busy machine, and a cold cache compiles kernels; waits end as soon as they can [s].
 DEADLINE = 60.0
+POLITENESS = 5.0  # in which a process that was asked to end may do so [s]
 
 
 class NodeProcess:
@@ -63,11 +64,18 @@ class NodeProcess:
         self.process.send_signal(number)
         return self.wait(deadline)
 
-    def kill(self) -> None:
-        """End it, whatever it does."""
+    def ask_to_end(self) -> None:
+        """Interrupt it unless it has ended: a killed process leaves its part of the shared memory as it was."""
         if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+
+    def end(self) -> None:
+        """Wait for its end a moment, then kill it."""
+        try:
+            self.process.wait(timeout=POLITENESS)
+        except subprocess.TimeoutExpired:
             self.process.kill()
-        self.process.wait()
+            self.process.wait()
 
 
 class RosTest:
@@ -99,7 +107,9 @@ class RosTest:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """End every process and leave the domain."""
         for process in self._processes:
-            process.kill()
+            process.ask_to_end()
+        for process in self._processes:
+            process.end()
             if error is not None:
                 print(f"--- {process.process.args}\n{process.log}", file=sys.stderr)
         self._executor.shutdown()
