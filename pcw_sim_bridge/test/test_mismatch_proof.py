@@ -12,11 +12,13 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_sim_bridge.mismatch.__main__ import main
+from pcw_sim_bridge.mismatch.all_cores import on_all_cores
 from pcw_sim_bridge.mismatch.explanation import NamedTerm
 from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
 from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
+from pcw_sim_bridge.mismatch.proof import moves_the_robot
 from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -213,6 +215,25 @@ def test_worse_is_what_is_no_chance() -> None:
     assert not len(nothing.judged)
     assert np.isnan(nothing.pooled().before).all()
     np.testing.assert_allclose(gap_closed(np.array([1.0, 1.0, 0.1]), np.array([0.1, 2.0, 0.1]), 0.1), [1.0, 0.0, 0.0])
+
+
+def test_below_its_floor_nothing_is_worse() -> None:
+    """Errors that grow, but not beyond what noise leaves in any case; and one that does, by how far it does."""
+    before = np.full((400, 2), 0.25)
+    errors = PairedErrors.of(before, 4.0 * before, np.arange(400) // 10, np.random.default_rng(4))
+    assert errors.worse() == pytest.approx([1.0, 1.0])
+    assert errors.worse(np.array([1.0, 0.64])) == pytest.approx([0.0, 0.25])
+
+
+@pytest.mark.parametrize(("effect", "moves"), [("imu_lever_arm", False), ("clock_offset", False), ("payload_mass", True)])
+def test_no_error_of_a_sensor_is_judged_by_simulations(effect: str, moves: bool) -> None:
+    assert moves_the_robot(effect) is moves
+
+
+def test_work_on_all_cores_keeps_its_order_and_its_errors() -> None:
+    assert on_all_cores(lambda number: number**2, range(50)) == [number**2 for number in range(50)]
+    with pytest.raises(ZeroDivisionError):
+        on_all_cores(lambda number: 1 / number, [1, 0, 2])
 
 
 def test_an_effect_that_begins_in_the_middle_is_supported_from_there() -> None:

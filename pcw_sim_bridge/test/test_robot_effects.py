@@ -45,12 +45,13 @@ def test_a_concealed_effect_is_named_with_its_numbers(plant: str, entry: dict[st
             print(f"{plant} {effect.name}.{name}: {value}, found {found.value:.4g} ({found.low:.4g} to {found.high:.4g})")
             if plant == "reduced":
                 assert found.low < float(value) < found.high  # type: ignore[arg-type]
-            else:  # leans on springs, which the rolling model does not
+            else:  # in space: tyres and bodies that the rolling model knows in the mean only
                 assert found.value == pytest.approx(value, rel=0.2)
             assert found.high - found.low < 0.9 * abs(float(value))  # type: ignore[arg-type]
     assert findings.fit is not None
-    before, after = findings.fit.inverse_nrmse
-    assert after < before
+    print(f"gap closed {findings.fit.gap_closed:.4f}, errors {findings.fit.inverse_nrmse}")
+    # In floors of the channels: most of an error over the spread is that of slips, which the model foretells to a third only.
+    assert findings.fit.gap_closed > 0.9
 
 
 def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from pcw_description.effect_instance import EffectInstance
 from .regression_problem import FloatArray
 from .robot_effects import ChannelModel, normal_along
 from .robot_motion import RobotMotion
-from .rolling_model import ModelNumbers, rolling_state
+from .rolling_model import ModelNumbers, RollingState, StraightTyres, Surroundings, rolling_state
 from .signal_filter import SignalFilter
 from .torque_response import TorqueResponse
 
@@ -31,7 +32,14 @@ class ChannelDifferences:
 
     def __init__(self, model: ChannelModel, motions: Sequence[RobotMotion], filters: Sequence[SignalFilter]) -> None:
         self.model, self.motions, self.filters = model, motions, filters
-        self._around = [model.around(motion) for motion in motions]
+        self._states: list[RollingState] = []
+        self._around: list[Surroundings] = []
+        for motion in motions:
+            around = model.around(motion)
+            state = rolling_state(motion, model.numbers, model.layout, around)
+            straight = StraightTyres.about(model.numbers, state.force, state.grip)
+            self._states.append(state)
+            self._around.append(dataclasses.replace(around, straight=straight))
         self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
         self.known = [np.isfinite(measured) for measured, _ in self._sides]
         self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])
@@ -81,10 +89,11 @@ class ChannelDifferences:
             (T, C, K), per unit of each of the K torques.
         """
         if self._responses is None:
-            self._responses = []
-            for motion, around in zip(self.motions, self._around, strict=True):
-                state = rolling_state(motion, self.model.numbers, self.model.layout, around)
-                self._responses.append(TorqueResponse(motion, self.model.numbers, self.model.layout, state))
+            self._responses = [
+                TorqueResponse(motion, self.model.numbers, self.model.layout, state, around.straight)
+                for motion, state, around in zip(self.motions, self._states, self._around, strict=True)
+                if around.straight is not None
+            ]
         parts = []
         for start in range(0, torques[0].shape[3], TORQUES_AT_ONCE):
             some = slice(start, start + TORQUES_AT_ONCE)

@@ -22,6 +22,7 @@ from pcw_description.effects.registry import all_effects, get
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
+from .held_commands import LARGEST_GAP, held_commands
 from .regression_problem import (
     BoolArray,
     Channel,
@@ -34,7 +35,6 @@ from .regression_problem import (
 )
 
 LARGEST_STEP = 1e-3  # [s] of the kernels
-LARGEST_GAP = 0.05  # [s]
 SHORTEST = 1.0  # [s]
 # Nobody knows how long a command was on its way within its own cycle: this part of a cycle either way.
 LATENCY_PART = 0.1
@@ -96,17 +96,13 @@ def commanded_joints(
     """Return the pieces of every joint (caster, axis) that has torque commands and reported torques in all recordings."""
     found: dict[tuple[int, int], list[CommandedJoint]] = {}
     for index, recording in enumerate(recordings):
-        commands, joints = recording.joint_commands, recording.joint_states
-        if commands is None or commands.effort is None or joints.effort is None or len(commands.stamp) < 2:
+        commands, joints = held_commands(robot, recording), recording.joint_states
+        if commands is None or joints.effort is None:
             return {}
-        limit = robot.torque_limit
-        # What is reported at a stamp is the answer to the command before it.
-        held = np.searchsorted(commands.stamp, joints.stamp - 1e-6, side="left") - 1
-        fresh = (held >= 0) & (joints.stamp - commands.stamp[np.maximum(held, 0)] < LARGEST_GAP)
         for i in range(robot.n):
             for axis in range(2):
-                command = np.clip(commands.effort[np.maximum(held, 0), i, axis], -limit[i, axis], limit[i, axis])
-                usable = fresh & np.isfinite(command) & np.isfinite(joints.effort[:, i, axis])
+                command = commands[:, i, axis]
+                usable = np.isfinite(command) & np.isfinite(joints.effort[:, i, axis])
                 for piece in _pieces(joints.stamp, np.asarray(usable)):
                     own = np.nan_to_num(joints.velocity[piece, i, axis])
                     found.setdefault((i, axis), []).append(

@@ -6,6 +6,7 @@
    alone reaches, at the wanted false-alarm rate, is the threshold.
 3. Prune: drop every term whose loss in evidence stays below the threshold, that does not lower the error on held-out
    blocks, or that moves no channel by a fair part of what is left of it. Exchange terms where another one does better.
+4. Settle: make the problem exact at what is left, ask whether something that was dropped is missing now, and prune again.
 """
 
 from __future__ import annotations
@@ -29,8 +30,16 @@ from .regression_problem import (
 from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression, predicted
 
 Progress = Callable[[str], None]
-# So many times the problem is made exact where its fit came out.
-EXACT_ROUNDS = 3
+# So many times the problem is made exact where its fit came out, or this part of the way there.
+EXACT_ROUNDS = 6
+STEPS = (1.0, 0.5, 0.2)
+GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
+SPLIT_AMONG = 12  # candidates that a term may have taken in
+DERIVED_FROM = 2  # after so many rounds that did not settle, columns are taken anew; after twice as many the next time
+# What happens once must explain so many times what is left anywhere: models err in bursts, and some shape fits one of them.
+ABOVE_BURSTS = 3.0
+# So often a chosen set is asked whether something that was dropped should come back.
+SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
 STEADY = 0.2
 # So many times the noise is estimated again, until no channel's falls by more than this.
@@ -110,13 +119,13 @@ class EffectSearch:
         self.progress = progress
         self.block: IntArray = contiguous_blocks(problem.segment, self.settings.blocks)
         self.ladder: list[LadderStep] = []
-        # Where the problem is exact: the effects there, and all numbers of the fit.
-        self._point: tuple[object, FloatArray] | None = None
+        # Where the problem is exact: all numbers of the description by name, of effects by term, shape and parameter.
+        self._point: dict[object, float] | None = None
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
         self.noise_gain = (0.0, 1.0)
 
     def run(self) -> Selection:
-        """Grow, calibrate, prune."""
+        """Grow, calibrate, prune, settle."""
         for _ in range(EXACT_ROUNDS):
             regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
             self._settle(regression, ())
@@ -126,60 +135,99 @@ class EffectSearch:
         regression = self.whiten_at(self.residual_of(instances))
         for _ in range(3):
             before = instances
-            instances = self.grow(regression, self.thin(regression, instances))
+            instances = self.improve(regression, self.thin(regression, instances))
+            instances = self.grow(regression, instances, self.settings.lenient_gain)
             regression = self.whiten_at(self.residual_of(instances))
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
-        instances = self.made_exact(instances)
-        regression = self.whiten_at(self.residual_of(instances))
         threshold = self.calibrate(regression, instances)
-        selection = self.prune(regression, instances, threshold)
-        chosen = self.made_exact(selection.fit.instances)
-        return self.prune(self.whiten_at(self.residual_of(chosen)), chosen, threshold)
+        return self.settle_on(self.prune(regression, instances, threshold), threshold)
+
+    def settle_on(self, selection: Selection, threshold: float) -> Selection:
+        """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
+
+        Of two terms that can do each other's work one goes first, and it may be the wrong one: that shows when the other goes.
+        """
+        for count in range(SECOND_THOUGHTS + 1):
+            chosen = self.made_exact(selection.fit.instances)
+            regression = self.whiten_at(self.residual_of(chosen))
+            wider = self.grow(regression, chosen, threshold, settling=True) if count < SECOND_THOUGHTS else chosen
+            if _terms(wider) != _terms(chosen):
+                here = self.problem, self._point
+                selection = self.prune(self.whiten_at(self.residual_of(wider)), wider, threshold)
+                if _terms(selection.fit.instances) != _terms(chosen):
+                    continue
+                self.problem, self._point = here
+            selection = self.prune(regression, chosen, threshold)
+            if _terms(selection.fit.instances) == _terms(chosen):
+                break
+        return selection
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
         """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.
 
-        What their first order leaves would pass for other effects.
+        What their first order leaves would pass for other effects. A step that leaves more than there was is halved.
         """
+        reshaped = False
         for count in range(EXACT_ROUNDS):
+            known = self.problem.point is not None and self.problem.point.derived
+            if count == (2 * DERIVED_FROM if known else DERIVED_FROM):
+                self.problem = self.problem.derived()
+            residual, cost = self._left_and_cost(instances)
+            fit = self.whiten_at(residual).fit(instances)
+            allowed = GROWTH * self._error(residual, residual) + 2.0 * cost
             before = self.problem, self._point
-            residual = self.residual_of(instances)
-            if not self._exact_at(self.whiten_at(residual).fit(instances)):
-                break
-            regression = self.whiten_at(residual)
-            again = instances
-            for index, instance in enumerate(instances):
-                if count == 0 and self.problem.terms[instance.term].once:
-                    others = (*again[:index], *again[index + 1 :])
-                    again = (*again[:index], self.refine_shape(regression, others, instance), *again[index + 1 :])
-            if self._error(self.residual_of(again), residual) > self._error(residual, residual):
+            for part in STEPS:
+                if not self._exact_at(fit, part):
+                    return instances
+                again = instances if reshaped else self._reshaped(instances, residual)
+                left, cost = self._left_and_cost(again)
+                if self._error(left, residual) + 2.0 * cost <= allowed:
+                    break
                 self.problem, self._point = before
-                break
-            instances = again
+            else:
+                return instances
+            instances, reshaped = again, True
         return instances
 
-    def _exact_at(self, fit: Fit) -> bool:
-        """Make the problem exact where a fit comes out; whether it was not so there."""
-        problem = self.problem
-        deviation = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
-        count = len(problem.nuisances)
-        changes = {n.name: float(mean) for n, mean in zip(problem.nuisances, fit.mean[:count], strict=True)}
-        sizes, position, flat = [], count, list(fit.mean[:count])
+    def _reshaped(self, instances: tuple[Instance, ...], residual: FloatArray) -> tuple[Instance, ...]:
+        """Search the shapes again of what is at work once."""
+        regression = self.whiten_at(residual)
+        for index, instance in enumerate(instances):
+            if self.problem.terms[instance.term].once:
+                others = (*instances[:index], *instances[index + 1 :])
+                found = self.refine_shape(regression, others, instance)
+                instances = (*instances[:index], found, *instances[index + 1 :])
+        return instances
+
+    def _exact_at(self, fit: Fit, part: float = 1.0) -> bool:
+        """Make the problem exact where a fit comes out, or a part of the way there; False where it has been so already."""
+        problem, terms = self.problem, self.problem.terms
+        keys: list[object] = [nuisance.name for nuisance in problem.nuisances]
+        bounds = [nuisance.changes for nuisance in problem.nuisances]
         for instance in fit.instances:
-            term = problem.terms[instance.term]
-            coefficients = np.zeros(len(term.parameters))
-            found = fit.mean[position : position + len(instance.active)]
-            bounds = [(term.parameters[k].lower, term.parameters[k].upper) for k in instance.active]
-            coefficients[list(instance.active)] = [float(np.clip(f, *b)) for f, b in zip(found, bounds, strict=True)]
-            flat += list(found)
-            sizes.append(SizedTerm(instance.term, instance.shape, coefficients))
-            position += len(instance.active)
-        point = (tuple((i.term, i.shape) for i in fit.instances), np.array(flat))
-        before, self._point = self._point, point
-        if before is not None and before[0] == point[0] and np.all(np.abs(point[1] - before[1]) < STEADY * deviation):
+            parameters = terms[instance.term].parameters
+            keys += [(instance.term, instance.shape, k) for k in instance.active]
+            bounds += [(parameters[k].lower, parameters[k].upper) for k in instance.active]
+        known = {} if self._point is None else self._point
+        wanted = np.array([float(np.clip(mean, *bound)) for mean, bound in zip(fit.mean, bounds, strict=True)])
+        start = np.array([known.get(key, value) for key, value in zip(keys, wanted, strict=True)])
+        for index, key in enumerate(keys):
+            # Its column is a secant, which leads past the size that is sought as far as the effect is curved.
+            power = problem.powers.get(key, 1.0)  # type: ignore[call-overload]
+            if power != 1.0 and wanted[index] * start[index] > 0.0:
+                wanted[index] = start[index] * (wanted[index] / start[index]) ** (1.0 / power)
+        deviation = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
+        if set(known) == set(keys) and np.all(np.abs(wanted - start) < STEADY * deviation):
             return False
-        self.problem = problem.exact_at(changes, sizes)
+        point = dict(zip(keys, start + part * (wanted - start), strict=True))
+        sizes = []
+        for instance in fit.instances:
+            coefficients = np.zeros(len(terms[instance.term].parameters))
+            coefficients[list(instance.active)] = [point[instance.term, instance.shape, k] for k in instance.active]
+            sizes.append(SizedTerm(instance.term, instance.shape, coefficients))
+        self._point = point
+        self.problem = problem.exact_at({n.name: point[n.name] for n in problem.nuisances}, sizes)
         return self.problem is not problem
 
     def _error(self, residual: FloatArray, noise: FloatArray) -> float:
@@ -215,11 +263,16 @@ class EffectSearch:
 
     def residual_of(self, instances: Sequence[Instance]) -> FloatArray:
         """Residual (T, C) of the least-squares fit of a set, with robust weights."""
-        residual = self.problem.residual
+        return self._left_and_cost(instances)[0]
+
+    def _left_and_cost(self, instances: Sequence[Instance]) -> tuple[FloatArray, float]:
+        """The same with what its re-tuning costs [nats]."""
+        residual, cost = self.problem.residual, 0.0
         for _ in range(3):
             regression = self.whiten_at(residual, white=True)
-            residual = regression.unwhitened_residual(regression.fit(instances))
-        return residual
+            fit = regression.fit(instances)
+            residual, cost = regression.unwhitened_residual(fit), regression.tolerance_cost(fit)
+        return residual, cost
 
     # -- 1 grow -------------------------------------------------------------------------------------------------
 
@@ -274,17 +327,19 @@ class EffectSearch:
             instances = instances[:index] + instances[index + 1 :]
         return instances
 
-    def grow(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
-        """Forward selection with a lenient threshold, exchanging terms where that helps."""
-        instances = self.improve(regression, instances)
+    def grow(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], least_gain: float, settling: bool = False
+    ) -> tuple[Instance, ...]:
+        """Forward selection of all that gains so much, exchanging terms where that helps, unless the set is settling."""
         while len(instances) < self.settings.largest_set:
             step = self.best_addition(regression, instances)
-            if step is None or step.gain < self.settings.lenient_gain:
+            if step is None or step.gain < least_gain:
                 break
             instances = (*instances, self.refine_shape(regression, instances, step.instance))
             self.progress(f"+ {self.label(instances[-1])}: gain {step.gain:.1f} nats")
             self.ladder.append(LadderStep(f"add {self.label(instances[-1])}", step.gain, None, "tried"))
-            instances = self.improve(regression, instances)
+            if not settling:
+                instances = self.improve(regression, instances)
         return instances
 
     def best_addition(
@@ -396,9 +451,10 @@ class EffectSearch:
         A single step cannot find this. A wide Stribeck curve passes for Coulomb plus a narrow one, and at its width
         adding Coulomb friction gains nothing.
         """
-        if len(self.problem.terms[instance.term].shapes) < 2:
+        own = self.problem.terms[instance.term]
+        if len(own.shapes) < 2 or own.once or own.turning:  # places, times and phases do not widen to take in another cause
             return None
-        for candidate in regression.scan(others)[0]:
+        for candidate in regression.scan(others)[0][:SPLIT_AMONG]:
             term = self.problem.terms[candidate.instance.term]
             if (
                 candidate.instance.term == instance.term
@@ -468,36 +524,104 @@ class EffectSearch:
         self, regression: WhitenedRegression, instances: tuple[Instance, ...], threshold: float
     ) -> Selection:
         """Drop the weakest term until all that remain pass every gate."""
-        rejected: set[tuple[int, tuple[tuple[str, float], ...]]] = set()
+        dropped: set[int] = set()  # terms: with a shape a little different they would come back for ever
+        rejected: set[int] = set()  # of these what no other term can have made superfluous
         while True:
             fit = regression.fit(instances)
             losses, held_out, shares = self.judge(regression, instances, fit)
-            failing = [
-                (loss, index)
-                for index, (loss, gain, share) in enumerate(zip(losses, held_out, shares, strict=True))
-                if loss < threshold or gain <= 0.0 or share < 1.0
-            ]
-            if not failing:
-                break
-            loss, index = min(failing)
-            reason = (
+            reasons = [
                 "below the threshold"
                 if loss < threshold
                 else "no gain held out"
-                if held_out[index] <= 0.0
+                if gain <= 0.0
                 else "below the details that remain"
-            )
-            self.progress(f"- {self.label(instances[index])}: {loss:.1f} nats, {reason}")
-            self.ladder.append(
-                LadderStep(f"drop {self.label(instances[index])}", loss, held_out[index], reason)
-            )
-            rejected.add((instances[index].term, instances[index].shape))
+                if share < 1.0
+                else ""
+                if within
+                else "beyond its bounds"
+                for loss, gain, share, within in zip(
+                    losses, held_out, shares, regression.each_within_bounds(fit), strict=True
+                )
+            ]
+            failing = [index for index, reason in enumerate(reasons) if reason]
+            if not failing:
+                needed = self.needed_together(regression, instances, fit)
+                if len(needed) == len(instances):
+                    break
+                for instance, loss in zip(instances, losses, strict=True):
+                    if instance not in needed:
+                        self._note_drop(self.label(instance), loss, "little together with others")
+                instances = needed
+                self._exact_at(regression.fit(instances))
+                regression = regression.moved(self.problem)
+                continue
+            index = min(failing, key=losses.__getitem__)
+            loss = losses[index]
+            self._note_drop(self.label(instances[index]), loss, reasons[index], held_out[index])
+            point = self.problem.point
+            elsewhere = point is not None and any(size.term == instances[index].term for size in point.sizes)
+            dropped.add(instances[index].term)
+            if loss >= threshold:
+                rejected.add(instances[index].term)
             instances = instances[:index] + instances[index + 1 :]
+            if elsewhere:  # the problem is exact at another place without the dropped one
+                self._exact_at(regression.fit(instances))
+                regression = regression.moved(self.problem)
             exchange = self.best_exchange(regression, instances, regression.fit(instances))
-            if exchange is not None and not any((i.term, i.shape) in rejected for i in exchange[1]):
+            if exchange is None:
+                continue
+            barred = dropped if len(exchange[1]) > len(instances) else rejected
+            if not any(i.term in barred for i in exchange[1] if i not in instances):
                 self.progress(exchange[0])
                 instances = exchange[1]
         return self.conclude(instances, threshold)
+
+    def _note_drop(self, label: str, loss: float, reason: str, held_out: float | None = None) -> None:
+        self.progress(f"- {label}: {loss:.1f} nats, {reason}")
+        self.ladder.append(LadderStep(f"drop {label}", loss, held_out, reason))
+
+    def needed_together(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
+    ) -> tuple[Instance, ...]:
+        """The fewest of the terms, taken as each does most, beside which all others together do too little to count.
+
+        A payload and stronger motors undo each other: without either the other is far off, without both little is.
+        """
+        order: list[Instance] = []
+        while len(order) < len(instances) - 1:
+            rest = [instance for instance in instances if instance not in order]
+            order.append(max(rest, key=lambda instance: regression.fit([*order, instance]).log_evidence))
+        residual = regression.unwhitened_residual(fit)
+        remains = self.channel_deviations(residual)
+        explained, cost = predicted(self.problem, fit), regression.tolerance_cost(fit)
+        for count in range(len(instances) - 1):
+            left_out = [instance for instance in instances if instance not in order[:count]]
+            without = regression.fit(order[:count])
+            least = max(self._least(instance) for instance in left_out)
+            change = self._sizes(explained - predicted(self.problem, without))
+            share = float(np.max(change / np.maximum(np.maximum(least * remains, self._details(left_out)), 1e-300)))
+            retuning = regression.tolerance_cost(without) - cost
+            if max(share, retuning / (len(left_out) * self.settings.smallest_threshold)) < 1.0:
+                return tuple(instance for instance in instances if instance in order[:count])
+        return instances
+
+    def _least(self, instance: Instance) -> float:
+        """Part of what remains in some channel that a term must do at least.
+
+        Columns with the residual's own noise explain a part of that noise; an effect is more than all of it.
+        """
+        return 1.0 if self.problem.terms[instance.term].noisy else self.settings.smallest_share
+
+    def _details(self, instances: Sequence[Instance]) -> FloatArray:
+        """What the model itself misjudges (C,), which is no effect: three deviations of its scale, and its slips.
+
+        What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that thrice.
+        """
+        scale = 3.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
+        if self.problem.misjudged is None:
+            return scale
+        noisy = any(self.problem.terms[instance.term].noisy for instance in instances)
+        return np.maximum(scale, (3.0 if noisy else 1.0) * self._sizes(self.problem.misjudged))
 
     def conclude(self, instances: Sequence[Instance], threshold: float) -> Selection:
         """Settle on a set: noise, fit and figures as they are with just these effects."""
@@ -518,13 +642,15 @@ class EffectSearch:
         if not instances:
             return [], [], []
         residual = regression.unwhitened_residual(fit)
-        valid = self.problem.valid
-        remains = np.array([robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])])
+        # In full: weights that hold down outliers would hold down the very bursts that an event is measured against.
+        information = np.array([channel.information for channel in self.problem.channels])
+        unexplained = regression.noise.whiten(residual, self.problem.valid, self.problem.segment) ** 2 @ information
+        remains = self.channel_deviations(residual)
         full_scores = regression.block_scores(instances)
         losses, held_out = [], []
         own: list[FloatArray] = []
         net: list[FloatArray] = []
-        retunings: list[float] = []
+        retunings, bursts = [], []
         explained = predicted(self.problem, fit)
         position = len(self.problem.nuisances)
         for index, instance in enumerate(instances):
@@ -543,17 +669,25 @@ class EffectSearch:
             # What a term does for the prediction is what the others cannot do in its place.
             change = explained - predicted(self.problem, without)
             net.append(self._sizes(change, _at_work(part) if once else None))
+            bursts.append(0.5 * self._largest_burst(unexplained, _at_work(part)) if once else 0.0)
             retunings.append(retuning)
         total = np.sqrt(np.sum(np.square(own), axis=0))
-        floor = np.maximum(self.settings.smallest_share * remains, self.settings.smallest_part * total)
-        # The model itself misjudges the measured side by so much; three deviations of that are no effect.
-        floor = np.maximum(floor, 3.0 * self.problem.scale_deviation * self._sizes(self.problem.measured))
         shares = []
-        for sizes, retuning in zip(net, retunings, strict=True):
+        for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
+            floor = np.maximum(self._least(instance) * remains, self.settings.smallest_part * total)
+            floor = np.maximum(floor, self._details([instance]))
             share = float(np.max(sizes / np.maximum(floor, 1e-300)))
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
-            shares.append(max(share, retuning / self.settings.smallest_threshold))
+            share = max(share, retunings[index] / self.settings.smallest_threshold)
+            shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
         return losses, held_out, shares
+
+    def _largest_burst(self, unexplained: FloatArray, at_work: BoolArray) -> float:
+        """Most that is left unexplained (T,), beyond what noise leaves, anywhere in a time as long as one at work (T,)."""
+        excess = unexplained - self.problem.valid.sum(axis=1) * float(np.sum(unexplained) / max(self.problem.valid.sum(), 1))
+        length = int(np.sum(at_work))
+        sums = np.cumsum(np.concatenate([[0.0], np.where(at_work, 0.0, excess)]))
+        return float(np.max(sums[length:] - sums[:-length], initial=0.0))
 
     def _sizes(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
         """Root mean square of (T, C) over valid samples, per channel; `among` some samples (T,) only."""
@@ -567,6 +701,11 @@ class EffectSearch:
         term = self.problem.terms[instance.term]
         shape = ", ".join(f"{name} {value:.4g}" for name, value in instance.shape if name in term.resolution)
         return f"{term.key} ({shape})" if shape else term.key
+
+
+def _terms(instances: Sequence[Instance]) -> tuple[int, ...]:
+    """Which terms are at work, and how often."""
+    return tuple(sorted(instance.term for instance in instances))
 
 
 def _at_work(part: FloatArray) -> BoolArray:

@@ -17,11 +17,14 @@ one. Whether it is there was asked with its size under the plain law as the scal
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import stats
+
+from pcw_description.effects.registry import get
 
 from .evidence_selection import EffectSearch, Progress, Selection, SelectionSettings
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
@@ -311,7 +314,8 @@ def _searched_again(search: EffectSearch, refined: _Refined, threshold: float) -
     keeper = refined.instances[refined.position]
     solid = tuple(instance for instance in refined.instances if instance not in refined.undecided)
     regression = search.whiten_at(search.residual_of(refined.instances))
-    found = search.prune(regression, search.grow(regression, solid), threshold).fit.instances
+    grown = search.grow(regression, search.improve(regression, solid), search.settings.lenient_gain)
+    found = search.prune(regression, grown, threshold).fit.instances
     if keeper not in found:
         return refined
     terms = {instance.term for instance in found}
@@ -380,7 +384,9 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             if parameter.hidden:
                 continue
             value = float(fit.mean[position + offset])
-            half = HALF_WIDTH * math.hypot(float(deviation[position + offset]), problem.scale_deviation * value)
+            # The column of an effect that is not in proportion to its size is a secant, the slope there is steeper or less so.
+            power = problem.powers.get((instance.term, instance.shape, parameter_index), 1.0)
+            half = HALF_WIDTH * math.hypot(float(deviation[position + offset]), problem.scale_deviation * value) / power
             low, high = parameter.interval(value - half, value + half)
             estimates[parameter.name] = Estimate(parameter.value(value), parameter.unit, low, high)
         others = fit.instances[:index] + fit.instances[index + 1 :]
@@ -403,7 +409,30 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
                 contribution,
             )
         )
-    return tuple(named)
+    return _doubted_by_scale(named)
+
+
+def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
+    """Say what else would do where one effect is on all casters with the same numbers at the drives and at the steerings.
+
+    Torques that are all wrong by one factor are also masses that are all wrong by it.
+    """
+    doubted = list(named)
+    for first, second in itertools.combinations(range(len(named)), 2):
+        one, other = named[first], named[second]
+        same = one.term.effect == other.term.effect and one.term.target == other.term.target and len(one.term.target) > 1
+        pairs = [(one.estimates[name], other.estimates[name]) for name in one.estimates if name in other.estimates]
+        overlap = all(a.low <= b.high and b.low <= a.high for a, b in pairs)
+        alike = tuple(name for name in get(one.term.effect).look_alikes if get(name).target_kind == "chassis")
+        if not (same and pairs and overlap and alike and one.term.axis != other.term.axis):
+            continue
+        for index in (first, second):
+            entry = doubted[index]
+            ambiguous = tuple(dict.fromkeys((*entry.ambiguous_with, *alike)))
+            # Which of them, the recordings do not say.
+            probability = min(entry.probability, 1.0 / (1.0 + len(alike)))
+            doubted[index] = dataclasses.replace(entry, ambiguous_with=ambiguous, probability=probability)
+    return tuple(doubted)
 
 
 def _profile(

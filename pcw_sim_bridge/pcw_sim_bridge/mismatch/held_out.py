@@ -164,7 +164,8 @@ def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> Re
         known = dict(zip((p.name for p in term.parameters), size.coefficients, strict=True))
         coefficients = np.array([known.get(p.name, 0.0) for p in other.terms[place].parameters])
         sizes.append(dataclasses.replace(size, term=place, coefficients=coefficients))
-    return other.exact_at(problem.point.changes, sizes)
+    exact = other.exact_at(problem.point.changes, sizes)
+    return exact.derived() if problem.point.derived else exact
 
 
 def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance], other: RegressionProblem) -> FloatArray:

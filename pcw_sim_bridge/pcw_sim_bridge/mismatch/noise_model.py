@@ -18,7 +18,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from scipy import sparse
+from scipy import linalg, sparse
 
 from .regression_problem import BoolArray, FloatArray, IntArray, segment_slices
 
@@ -42,59 +42,79 @@ class NoiseModel:
         """Samples before the present one that the filters look at."""
         return int(self.taps.shape[1]) - 1
 
-    def filtered(self, values: FloatArray, segment: IntArray) -> FloatArray:
-        """Filter (T, C) or (T, C, K) channel by channel; the first `memory` samples of a segment become NaN."""
-        memory = self.memory
-        result = np.full(values.shape, np.nan)
-        for piece in segment_slices(segment):
-            block = values[piece]
-            if len(block) <= memory:
-                continue
-            for channel, taps in enumerate(self.taps):
-                convolution = _convolution(taps.tobytes(), len(block))
-                result[piece.start + memory : piece.stop, channel] = convolution @ block[:, channel]
+    @functools.cached_property
+    def is_white(self) -> bool:
+        """Whether the noise of every sample of every channel is independent of all others."""
+        return self.memory == 0 and np.array_equal(self.correlation, np.eye(len(self.taps)))
+
+    def filtered(self, values: FloatArray, valid: BoolArray, segment: IntArray) -> FloatArray:
+        """Filter (T, C) or (T, C, K) channel by channel, zero where not valid.
+
+        The first samples after a gap are foretold from as many as there are since, as well as these allow.
+        """
+        result = np.zeros(values.shape)
+        for channel, taps in enumerate(self.taps):
+            position = _since_gap(valid[:, channel], segment)
+            result[:, channel] = _filter_matrix(np.trim_zeros(taps, "b").tobytes(), position.tobytes()) @ values[:, channel]
         return result
 
-    def usable(self, valid: BoolArray, segment: IntArray) -> BoolArray:
-        """Samples whose whole filter window is valid, (T, C)."""
-        usable = np.zeros_like(valid)
-        for piece in segment_slices(segment):
-            block = valid[piece]
-            if len(block) <= self.memory:
-                continue
-            window = block[self.memory :].copy()
-            for lag in range(1, self.memory + 1):
-                window &= block[self.memory - lag : len(block) - lag]
-            usable[piece.start + self.memory : piece.stop] = window
-        return usable
-
     def whiten(self, values: FloatArray, valid: BoolArray, segment: IntArray) -> FloatArray:
-        """Return whitened values: (T, C) or (T, C, K) -> the same shape, zero where not usable.
+        """Return whitened values: (T, C) or (T, C, K) -> the same shape, zero where not valid.
 
         Rows with some channels masked are decorrelated with the correlation of the others.
         """
-        filtered = self.filtered(values, segment)
-        usable = self.usable(valid, segment)
+        if self.is_white:  # nothing ties a sample to others
+            scale = np.where(valid, self.taps[:, 0], 0.0)
+            return values * scale.reshape(*scale.shape, *(1,) * (values.ndim - 2))
+        filtered = self.filtered(values, valid, segment)
         white = np.zeros_like(filtered)
-        codes = usable @ (1 << np.arange(usable.shape[1], dtype=np.int64))
+        codes = valid @ (1 << np.arange(valid.shape[1], dtype=np.int64))
         for code in np.unique(codes):
             if code == 0:
                 continue
             rows = np.flatnonzero(codes == code)
-            present = np.flatnonzero(usable[rows[0]])
+            present = np.flatnonzero(valid[rows[0]])
             root = np.linalg.cholesky(self.correlation[np.ix_(present, present)])
             decorrelated = np.linalg.inv(root) @ filtered[np.ix_(rows, present)].reshape(len(rows), len(present), -1)
             white[np.ix_(rows, present)] = decorrelated.reshape(len(rows), len(present), *values.shape[2:])
         return white
 
 
-@functools.lru_cache(maxsize=128)
-def _convolution(content: bytes, count: int) -> sparse.csr_array:
-    """Matrix (count - L + 1, count) that filters with taps (L,), given by content, where the whole filter has samples."""
-    taps = np.frombuffer(content)
-    rows = count - len(taps) + 1
-    diagonals = np.repeat(taps[::-1][:, None], count, axis=1)
-    return sparse.dia_array((diagonals, np.arange(len(taps))), shape=(rows, count)).tocsr()
+def _since_gap(valid: BoolArray, segment: IntArray) -> IntArray:
+    """How many samples before each one (T,) belong to the same run of valid ones; -1 where it is not valid itself."""
+    index = np.arange(len(valid))
+    begins = valid & ~np.r_[False, valid[:-1] & (segment[1:] == segment[:-1])]
+    start = np.maximum.accumulate(np.where(begins, index, 0))
+    position: IntArray = np.where(valid, index - start, -1)
+    return position
+
+
+@functools.lru_cache(maxsize=256)
+def _filter_matrix(content: bytes, positions: bytes) -> sparse.csr_array:
+    """Matrix (T, T) that filters with taps (L,), both given by content, after gaps by fewer of them."""
+    taps, position = np.frombuffer(content), np.frombuffer(positions, dtype=np.int64)
+    weights = _weights_after_gaps(taps)
+    rows, columns, entries = [], [], []
+    for lag in range(len(taps)):
+        there = np.flatnonzero(position >= lag)
+        rows.append(there)
+        columns.append(there - lag)
+        entries.append(weights[np.minimum(position[there], len(taps) - 1), lag])
+    places = np.concatenate(rows), np.concatenate(columns)
+    return sparse.coo_array((np.concatenate(entries), places), shape=(len(position), len(position))).tocsr()
+
+
+def _weights_after_gaps(taps: FloatArray) -> FloatArray:
+    """Weights (L, L) of the present sample and those before it, by how many there are: the whitening of what taps whiten."""
+    count = len(taps)
+    spectrum = 1.0 / np.maximum(np.abs(np.fft.rfft(taps, 2 * _SPECTRUM_POINTS)) ** 2, 1e-300)
+    covariance = linalg.toeplitz(np.fft.irfft(spectrum)[:count])
+    inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+    weights = np.zeros((count, count))
+    for before in range(count):
+        weights[before, : before + 1] = inverse[before, before::-1] if before else inverse[0, :1]
+    weights[-1] = taps
+    return weights
 
 
 def huber_weights(standardised: FloatArray) -> FloatArray:
@@ -134,7 +154,7 @@ def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -
     for channel, own in enumerate(filters):
         taps[channel, : min(length, len(own))] = own[:length]
     model = NoiseModel(taps, np.eye(channels))
-    return NoiseModel(taps, _correlation(model.filtered(residual, segment), model.usable(valid, segment)))
+    return NoiseModel(taps, _correlation(model.filtered(residual, valid, segment), valid))
 
 
 def white_noise_model(residual: FloatArray, valid: BoolArray) -> NoiseModel:
@@ -147,8 +167,7 @@ def _autoregression(
     values: FloatArray, valid: BoolArray, segment: IntArray, order: int
 ) -> tuple[FloatArray, float]:
     """Coefficients (order,) and innovation deviation, by iteratively reweighted least squares."""
-    window = NoiseModel(np.ones((1, order + 1)), np.eye(1))
-    rows = np.flatnonzero(window.usable(valid[:, None], segment)[:, 0])
+    rows = np.flatnonzero(_since_gap(valid, segment) >= order)
     if len(rows) < 5 * (order + 1):
         usable = values[valid]
         return np.zeros(0), robust_deviation(usable)

@@ -14,6 +14,7 @@ withdrawn and the dependence reported instead.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -420,7 +421,9 @@ class AugmentedFit:
         self.own = functions.shape[1]
         self.deviations = np.concatenate([regression.deviations(self.instances), size / spread])
 
+    @functools.cached_property
     def _grams(self) -> FloatArray:
+        """Gram matrices of set, function and target by block."""
         stacked = np.concatenate([self.design, self.regression.target[:, None]], axis=1)
         return np.stack([stacked[piece].T @ stacked[piece] for piece in self.regression.blocks])
 
@@ -430,7 +433,7 @@ class AugmentedFit:
 
     def held_out_errors(self) -> tuple[float, float]:
         """Squared whitened error on held-out blocks without and with the function."""
-        grams = self._grams()
+        grams = self._grams
         total = grams.sum(axis=0)
         base = len(self.deviations) - self.own
         errors = [0.0, 0.0]
@@ -444,7 +447,7 @@ class AugmentedFit:
 
     def held_out_residuals(self, problem: RegressionProblem, block: IntArray, channel: int) -> FloatArray:
         """Residual of the channel in its own unit (T,), every block predicted from the others."""
-        grams = self._grams()
+        grams = self._grams
         total = grams.sum(axis=0)
         parts = [problem.nuisance_columns()]
         for instance in self.instances:
@@ -459,11 +462,11 @@ class AugmentedFit:
 
     def weights(self) -> FloatArray:
         """Coefficients of the function, from all blocks."""
-        return self._posterior(self._grams().sum(axis=0), len(self.deviations))[-self.own :]
+        return self._posterior(self._grams.sum(axis=0), len(self.deviations))[-self.own :]
 
     def log_evidence(self) -> float:
         """Evidence of set and function, comparable with that of the regression's own fits."""
-        gram = self._grams().sum(axis=0)
+        gram = self._grams.sum(axis=0)
         scaled = gram[:-1, :-1] * np.outer(self.deviations, self.deviations) + np.eye(len(self.deviations))
         moment = gram[:-1, -1] * self.deviations
         factor = np.linalg.cholesky(scaled)

@@ -63,13 +63,18 @@ class PairedErrors:
         # A draw may leave out all blocks in which one quantity could be judged.
         return PairedErrors(*(_mean(part, share) for part in parts))
 
-    def worse(self) -> FloatArray:
-        """By what part the root mean square error has grown (K,), zero where that may be chance (95 %) or it has not."""
+    def worse(self, floors: FloatArray | None = None) -> FloatArray:
+        """By what part the root mean square error has grown (K,), zero where that may be chance (95 %) or it has not.
+
+        Args:
+            floors: squared errors (K,) below which there is no better and no worse; None: of 0.
+        """
         found = np.zeros(len(self.before))
+        least = np.full(len(self.before), 1e-300) if floors is None else floors
         for k in self.judged:
             change = self.after_draws[:, k] - self.before_draws[:, k]
             if np.quantile(change[np.isfinite(change)], 0.025) > 0.0 and self.after[k] > self.before[k]:
-                found[k] = np.sqrt(self.after[k] / max(self.before[k], 1e-300)) - 1.0
+                found[k] = max(np.sqrt(self.after[k] / max(self.before[k], least[k])) - 1.0, 0.0)
         return found
 
 

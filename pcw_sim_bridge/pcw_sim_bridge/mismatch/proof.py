@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pcw_description.effects.kinds import ClockEffect, ImuEffect
+from pcw_description.effects.kinds import TransmissionEffect
 from pcw_description.effects.registry import get
 
 from .errors import MismatchError
@@ -30,6 +30,7 @@ from .whitened_regression import Instance
 HEALTHY = 3.0  # tolerances
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
+LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to speak against an effect
 LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
@@ -66,8 +67,13 @@ def is_event(effect_name: str) -> bool:
 
 
 def moves_the_robot(effect_name: str) -> bool:
-    """Whether a simulation can tell for or against an effect: no error of an IMU or of its clock moves a robot."""
-    return not isinstance(get(effect_name), (ImuEffect, ClockEffect))
+    """Whether a simulation can tell for or against an effect.
+
+    No error of an IMU or of a clock moves a robot; and how far a gear is wound up where a simulation begins, and how fast,
+    cannot be read from filtered signals.
+    """
+    effect = get(effect_name)
+    return effect.target_kind not in ("imu", "clock") and not isinstance(effect, TransmissionEffect)
 
 
 class Prover:
@@ -220,9 +226,14 @@ class Prover:
         for index in moving:
             without = self._rollout(explanation, held_out, index)
             assert without is not None
-            errors = _rollout_errors(windows, without, after, self.rng, [MAIN_HORIZON]).pooled()
+            # Where a simulation ran away it says nothing for or against an effect.
+            away = _ran_away(windows, without) | _ran_away(windows, after)
+            if np.sum(~away) < LEAST_WINDOWS:
+                continue
+            before, with_it = (np.where(away[:, None, None], np.nan, squares) for squares in (without, after))
+            errors = _rollout_errors(windows, before, with_it, self.rng, [MAIN_HORIZON]).pooled()
             harms.append((float(errors.worse()[0]), index))
-        worst, index = max(harms)
+        worst, index = max(harms, default=(0.0, 0))
         return (index, "the simulation follows less well with it") if worst > 0.0 else None
 
     def _rollout(self, explanation: Explanation, held_out: HeldOut, without: int | None = None) -> FloatArray | None:
@@ -284,10 +295,10 @@ class Prover:
         for name in dict.fromkeys(n.term.effect for n in explanation.named if is_event(n.term.effect)):
             remarks.append(f"{name} comes once, from outside: the time in which it acts is left out of the proof.")
         if self.windows is not None and after is not None:
-            limited = self.windows.relative(after)[:, MAIN_HORIZON]
-            away = int(np.sum(np.any(limited >= RAN_AWAY**2, axis=1)))
-            if away:
-                remarks.append(f"Driven by the measured torques the simulation ran away in {away} of {len(limited)} windows.")
+            away = _ran_away(self.windows, after)
+            if away.any():
+                share = f"{away.sum()} of {len(away)}"
+                remarks.append(f"Driven by the measured torques the simulation ran away in {share} windows.")
         return remarks
 
     def _finding(
@@ -307,7 +318,8 @@ class Prover:
         weights = _shares(explanation, problem)
         pooled = inverse.pooled(weights)
         floor = float(np.sqrt(np.average(floors[judged] ** 2, weights=weights[judged]))) if len(judged) else 0.0
-        worse = {problem.channels[k].name: float(inverse.worse()[k]) for k in judged}
+        grown = inverse.worse(floors**2)
+        worse = {problem.channels[k].name: float(grown[k]) for k in judged}
         for recording in np.unique(problem.recording):
             rows = problem.recording == recording
             block = blocks_of(problem.recording[rows], problem.time[rows])
@@ -435,6 +447,12 @@ def _both(errors: PairedErrors, k: int) -> tuple[float, float, tuple[float, floa
         interval(np.sqrt(errors.before_draws[:, k])),
         interval(np.sqrt(errors.after_draws[:, k])),
     )
+
+
+def _ran_away(windows: Windows, squares: FloatArray) -> np.ndarray:
+    """Windows (W,) in which a simulation left all bounds by the main horizon."""
+    ran_away: np.ndarray = np.any(windows.relative(squares)[:, MAIN_HORIZON] >= RAN_AWAY**2, axis=1)
+    return ran_away
 
 
 def _rollout_errors(

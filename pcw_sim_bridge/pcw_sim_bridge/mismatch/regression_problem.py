@@ -13,6 +13,8 @@ problem; the engine knows nothing of axes and robots.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -21,6 +23,11 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
+
+# An effect smaller than this part of its prior deviation is in proportion to its size.
+CURVED_FROM = 0.01
+# The power of its size that an effect is in proportion to is taken from this part of it to all of it, within these.
+WEAKER, POWERS = 0.8, (0.5, 3.0)
 
 Shape = Mapping[str, float]  # values of the shaping parameters of one candidate
 
@@ -49,6 +56,7 @@ class Nuisance:
         nominal: value in the description, in `unit`.
         deviation: standard deviation, same unit.
         column: d residual / d value, (T, C).
+        changes: least and largest change that makes sense.
     """
 
     name: str
@@ -56,6 +64,7 @@ class Nuisance:
     nominal: float
     deviation: float
     column: FloatArray
+    changes: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +75,7 @@ class LinearParameter:
         lower, upper, deviation: bounds and prior deviation of the coefficient.
         refinement: zero unless there is evidence for it; not part of the effect when it is first named.
         origin: value of the parameter where the coefficient is zero.
-        reciprocal: the coefficient is the inverse of the parameter, less that of the origin.
+        reciprocal: the coefficient is the inverse of the parameter, less that of the origin; squared: it is its square.
         hidden: it is no number of the effect, only of how much of it there is.
     """
 
@@ -78,16 +87,21 @@ class LinearParameter:
     refinement: bool = False
     origin: float = 0.0
     reciprocal: bool = False
+    squared: bool = False
     hidden: bool = False
 
     def value(self, coefficient: float) -> float:
         """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""
         if self.reciprocal:
             return 1.0 / max(coefficient + 1.0 / self.origin, 1e-12)
+        if self.squared:
+            return math.sqrt(max(coefficient, 0.0))
         return self.origin + coefficient
 
     def coefficient(self, value: float) -> float:
         """Return the coefficient of a value."""
+        if self.squared:
+            return value**2
         return 1.0 / value - 1.0 / self.origin if self.reciprocal else value - self.origin
 
     def interval(self, low: float, high: float) -> tuple[float, float]:
@@ -115,7 +129,9 @@ class Term:
         grid_size: how many shapes `shapes` were chosen from, where a first look has narrowed them down.
         log_prior: of the effect (see there), part of every evidence.
         whole: shaping parameters that are whole numbers unless the recording says otherwise (periods per turn).
-        is_exact: the problem's exact residual holds it.
+        is_exact: the problem's exact residual holds it; is_curved: and it is not in proportion to its parameters.
+        turning: a phase or a direction shapes it, of which two a quarter turn apart make all others.
+        noisy: its columns hold some of the noise that the residual holds, by the control that acts on that noise.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
     """
 
@@ -133,6 +149,9 @@ class Term:
     axis: str | None = None
     whole: tuple[str, ...] = ()
     is_exact: bool = False
+    is_curved: bool = False
+    turning: bool = False
+    noisy: bool = False
     once: bool = False
 
     @property
@@ -157,10 +176,11 @@ class SizedTerm:
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """Where a problem is exact: changes of nuisances, by name, and sizes of effects."""
+    """Where a problem is exact: changes of nuisances, by name, and sizes of effects; whether its columns are of there, too."""
 
     changes: Mapping[str, float]
     sizes: tuple[SizedTerm, ...]
+    derived: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,7 +221,10 @@ class RegressionProblem:
         exact: (changes of nuisances by name, sizes of effects) -> residual (T, C) of the model with all of them at work, and
             the names of the nuisances that it holds; None from it where there is no such model, and instead of it where the
             columns are exact everywhere.
+        derive: (changes, sizes) -> columns of nuisances there, by name; None where `exact` is.
         nominal: residual of the description as it is, where `residual` is exact elsewhere; point: where.
+        powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
+            the parameters themselves.
     """
 
     channels: tuple[Channel, ...]
@@ -219,8 +242,10 @@ class RegressionProblem:
     scale_deviation: float = 0.0
     sites: Sites | None = None
     exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
+    derive: Callable[[Mapping[str, float], Sequence[SizedTerm]], Mapping[str, FloatArray] | None] | None = None
     nominal: FloatArray | None = None
     point: Point | None = None
+    powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -259,7 +284,9 @@ class RegressionProblem:
         """Return the problem with a residual that the columns explain exactly where numbers and effects are of these sizes.
 
         Columns are derivatives at the description. To the residual of the model there, r(x), is added what the columns take:
-        r(x) + J x. A fit that comes out at x has then found a minimum of the model itself, not of its first order.
+        r(x) + J x. A fit that comes out at x has then found a minimum of the model itself, not of its first order. An effect
+        that is not in proportion to its size has a secant for a column instead, from none of it to its size: the problem is
+        then exact with and without it.
 
         Args:
             changes: of the nuisances, by name.
@@ -273,16 +300,80 @@ class RegressionProblem:
         if found is None:
             return self
         residual, taken = found
+        columns: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = {}
+        powers: dict[tuple[int, tuple[tuple[str, float], ...], int], float] = {}
+        for index, size in enumerate(sizes):
+            if size.term < len(self.terms) and self.terms[size.term].is_exact:
+                place = size.term, size.shape
+                columns[place], found_powers = self._secants(changes, sizes, index, residual)
+                powers |= {(*place, k): power for k, power in found_powers.items()}
         for name in taken:
             residual = residual + known[name].column * changes[name]
         for size in sizes:
-            if size.term < len(self.terms) and self.terms[size.term].is_exact:
-                residual = residual + self.columns(size.term, size.shape) @ size.coefficients
+            if (size.term, size.shape) in columns:
+                residual = residual + columns[size.term, size.shape] @ size.coefficients
         moved = dataclasses.replace(
-            self, residual=residual, nominal=self.nominal_residual, point=Point(dict(changes), tuple(sizes))
+            self,
+            residual=residual,
+            nominal=self.nominal_residual,
+            powers=powers,
+            point=Point(dict(changes), tuple(sizes), self.point is not None and self.point.derived),
         )
         moved._remembered.update(self._remembered)
+        moved._remembered.update(columns)
         return moved
+
+    def derived(self) -> RegressionProblem:
+        """Return the problem with the nuisances' columns as they are where it is exact, instead of at the description."""
+        if self.derive is None or self.point is None:
+            return self
+        columns = self.derive(self.point.changes, [size for size in self.point.sizes if size.term < len(self.terms)])
+        if columns is None:
+            return self
+        residual, nuisances = self.residual, []
+        for nuisance in self.nuisances:
+            column = columns.get(nuisance.name, nuisance.column)
+            residual = residual + (column - nuisance.column) * self.point.changes.get(nuisance.name, 0.0)
+            nuisances.append(dataclasses.replace(nuisance, column=column))
+        point = dataclasses.replace(self.point, derived=True)
+        moved = dataclasses.replace(self, residual=residual, nuisances=tuple(nuisances), point=point)
+        moved._remembered.update(self._remembered)
+        return moved
+
+    def _secants(
+        self, changes: Mapping[str, float], sizes: Sequence[SizedTerm], index: int, residual: FloatArray
+    ) -> tuple[FloatArray, dict[int, float]]:
+        """Columns (T, C, P) of one effect from none of it to its size, where that tells more than its derivative.
+
+        With them the powers of the parameters that what the effect does is in proportion to there.
+        """
+        size = sizes[index]
+        term, columns = self.terms[size.term], self.columns(size.term, size.shape)
+        powers: dict[int, float] = {}
+        if not term.is_curved:
+            return columns, powers
+        columns = columns.copy()
+
+        def scaled(k: int, part: float) -> FloatArray | None:
+            changed = size.coefficients.copy()
+            changed[k] *= part
+            others = [*sizes[:index], dataclasses.replace(size, coefficients=changed), *sizes[index + 1 :]]
+            assert self.exact is not None
+            found = self.exact(changes, [other for other in others if other.term < len(self.terms)])
+            return None if found is None else found[0]
+
+        for k, (parameter, coefficient) in enumerate(zip(term.parameters, size.coefficients, strict=True)):
+            if abs(coefficient) < CURVED_FROM * parameter.deviation:
+                continue
+            without, weaker = scaled(k, 0.0), scaled(k, WEAKER)
+            if without is None or weaker is None:
+                continue
+            work = without - residual
+            columns[:, :, k] = work / coefficient
+            ratio = float(np.sum(work * (without - weaker))) / max(float(np.sum(work**2)), 1e-300)
+            if ratio > 0.0:
+                powers[k] = float(np.clip(math.log(ratio) / math.log(WEAKER), *POWERS))
+        return columns, powers
 
     @property
     def nominal_residual(self) -> FloatArray:
@@ -290,7 +381,11 @@ class RegressionProblem:
         return self.residual if self.nominal is None else self.nominal
 
     def nuisance_columns(self) -> FloatArray:
-        """Nuisance columns side by side, (T, C, K)."""
+        """Nuisance columns side by side, (T, C, K), not to be changed."""
+        return self._stacked
+
+    @functools.cached_property
+    def _stacked(self) -> FloatArray:
         if not self.nuisances:
             return np.zeros((*self.residual.shape, 0))
         return np.stack([nuisance.column for nuisance in self.nuisances], axis=2)

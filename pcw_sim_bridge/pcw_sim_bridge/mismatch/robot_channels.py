@@ -19,6 +19,7 @@ from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
 
 from ..plants.true_robot import as_it_really_is
+from .all_cores import on_all_cores
 from .channel_differences import ChannelDifferences
 from .errors import MismatchError
 from .first_look import Looked, remainder
@@ -26,17 +27,21 @@ from .found_effect import effect_instance
 from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, SizedTerm, Term
 from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
-from .robot_nuisances import robot_nuisances, varied_numbers
+from .robot_nuisances import (
+    FLOOR,
+    MODEL_DEVIATION,
+    VariedNumber,
+    floor_nuisances,
+    robot_nuisances,
+    varied_numbers,
+)
 from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, twists
 from .signal_filter import SignalFilter
 
 # Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
 SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
-# By about this part the rolling model misjudges forces, whatever the noise: tyres are quasi-static in it, bodies do not lean
-# on their springs. Seen as the error of friction concealed in simulated robots, which is more of one sign than noise makes it.
-MODEL_DEVIATION = 0.007
-# By about this part it misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
+# By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
@@ -76,9 +81,9 @@ class RobotProblemBuilder:
         described = as_it_really_is(robot)
         self.numbers = ModelNumbers.of(described)
         self._read = motions
-        self.motions = with_pose([true_motion(described, motion) for motion in motions], self.numbers)
-        self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
         self.model = ChannelModel(described, self.numbers, self.layout)
+        self.motions = self._motions_of(self.model)
+        self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
     def balanced(self) -> bool:
@@ -93,10 +98,10 @@ class RobotProblemBuilder:
         """Return the regression problem of all recordings.
 
         Args:
-            with_terms: False leaves out candidate effects and variables: residual and tolerances alone are many times cheaper.
+            with_terms: False leaves out candidate effects: residual and tolerances alone are many times cheaper.
         """
         differences = ChannelDifferences(self.model, self.motions, self.filters)
-        along = self._along_motions(differences) if with_terms else {}
+        along = self._along_motions(differences)
         valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
         stamps = [f.decimate(m.time) for f, m in zip(self.filters, self.motions, strict=True)]
         time = np.concatenate(stamps)
@@ -124,13 +129,49 @@ class RobotProblemBuilder:
             misjudged=self._misjudged(differences),
             scale_deviation=self._scale_deviation(),
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
-            exact=functools.partial(self._exact, differences, terms) if with_terms else None,
+            exact=functools.partial(self._exact, differences, terms),
+            derive=functools.partial(self._derive, differences, terms),
         )
 
     def _exact(
         self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
     ) -> tuple[FloatArray, Sequence[str]] | None:
         """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be."""
+        varied = [n for n in varied_numbers(self.robot, differences) if n.label in changes]
+        model = self._model_at(varied, terms, changes, sizes)
+        if model is None:
+            return None
+        lean = np.array([*(changes.get(name, 0.0) for name in FLOOR), 0.0])
+        pieces = []
+        for motion in self._motions_of(model):
+            around = model.around_leaning(motion, model.around(motion), lean) if lean.any() else model.around(motion)
+            measured, predicted = model.sides(motion, around)
+            if lean.any():
+                model.lean(motion, lean, measured, predicted)
+            pieces.append(np.nan_to_num(measured - predicted))
+        return differences.filtered(pieces), [*(n.label for n in varied), *(name for name in FLOOR if name in changes)]
+
+    def _derive(
+        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
+    ) -> Mapping[str, FloatArray] | None:
+        """Columns (T, C) of the numbers where they are changed so and effects are at work; None where they cannot be."""
+        varied = varied_numbers(self.robot, differences)
+        model = self._model_at([n for n in varied if n.label in changes], terms, changes, sizes)
+        if model is None:
+            return None
+        there = ChannelDifferences(model, self._motions_of(model), self.filters)
+        columns = on_all_cores(lambda n: there.of_numbers(n.vary, 0.5 * n.deviation), varied)
+        found = {n.label: column for n, column in zip(varied, columns, strict=True)}
+        return found | {nuisance.name: nuisance.column for nuisance in floor_nuisances(self.robot, there)}
+
+    def _model_at(
+        self,
+        varied: Sequence[VariedNumber],
+        terms: Sequence[Term],
+        changes: Mapping[str, float],
+        sizes: Sequence[SizedTerm],
+    ) -> ChannelModel | None:
+        """The channel model with numbers changed and effects at work; None where they cannot be."""
         instances = []
         for size in sizes:
             term = terms[size.term]
@@ -144,18 +185,13 @@ class RobotProblemBuilder:
         except PcwError:
             return None
         numbers = ModelNumbers.of(described)
-        taken = []
-        for number in varied_numbers(self.robot, differences):
-            if number.label in changes:
-                number.vary(numbers, changes[number.label])
-                taken.append(number.label)
-        model = ChannelModel(described, numbers, self.layout)
-        motions = with_pose([true_motion(described, motion) for motion in self._read], numbers)
-        pieces = []
-        for motion in motions:
-            measured, predicted = model.sides(motion, model.around(motion))
-            pieces.append(np.nan_to_num(measured - predicted))
-        return differences.filtered(pieces), taken
+        for number in varied:
+            number.vary(numbers, changes[number.label])
+        return ChannelModel(described, numbers, self.layout)
+
+    def _motions_of(self, model: ChannelModel) -> list[RobotMotion]:
+        """What was read, as the joints of a model moved."""
+        return with_pose([true_motion(model.robot, motion) for motion in self._read], model.numbers)
 
     def _wheels(self) -> tuple[FloatArray, FloatArray]:
         """Places (T, n, 2) [m] and headings (T, n) [rad] of the wheels in the world."""
@@ -211,7 +247,7 @@ class RobotProblemBuilder:
                 signals[f"drive_normal_force/{caster}"] = normal[:, i]
                 for axis, axis_name in enumerate(AXIS_NAMES):
                     signals[f"{axis_name}_velocity/{caster}"] = motion.velocity[:, i, axis]
-                    signals[f"{axis_name}_torque/{caster}"] = motion.torque[:, i, axis]
+                    signals[f"{axis_name}_torque/{caster}"] = motion.quiet_torque[:, i, axis]
             for name, values in signals.items():
                 found.setdefault(name, []).append(np.ascontiguousarray(values))
         return found

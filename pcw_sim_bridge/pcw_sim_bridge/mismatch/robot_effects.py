@@ -145,7 +145,7 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
     coupling = robot.gear_matrix[i] / diagonal[:, None]
     rotors = robot.casters[i].rotors
     rotor = (rotors.drive, rotors.steer)[axis] * diagonal[axis] ** 2
-    shaft = motion.torque[:, i] @ np.linalg.inv(coupling)
+    shaft = motion.quiet_torque[:, i] @ np.linalg.inv(coupling)
     torque = shaft[:, axis] - rotor * (motion.acceleration[:, i] @ coupling[axis])
     ahead = torque / gear.stiffness
     if gear.play > 0.0:
@@ -230,7 +230,7 @@ class ChannelModel:
             axis = AXIS_NAMES.index(instance.axis or effect.axis)
             for name in instance.target:
                 i = self.robot.caster_index(name)
-                position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.torque))
+                position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.quiet_torque))
                 torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
             return dataclasses.replace(around, torque=torque)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()

@@ -10,6 +10,7 @@ import numpy as np
 from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
 
+from .held_commands import quiet_torque
 from .regression_problem import BoolArray, FloatArray
 from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
 
@@ -35,6 +36,7 @@ class RobotMotion:
         rate: [Hz]; cutoff: of the wide filter [Hz].
         sampling: interval of joint_states [s].
         position, velocity, acceleration, torque, torque_rate: joints (T, n, 2).
+        quiet_torque: the torque without the noise of its measurement, where that can be had (T, n, 2).
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: its velocity in base_link (T, 3); NaN where not recorded.
@@ -50,6 +52,7 @@ class RobotMotion:
     acceleration: FloatArray
     torque: FloatArray
     torque_rate: FloatArray
+    quiet_torque: FloatArray
     imu: FloatArray
     pose: FloatArray
     tracked_twist: FloatArray
@@ -83,7 +86,9 @@ def read_motions(
             imu[:, column] = np.interp(
                 joints.stamp, recording.imu.stamp, measured[:, column], left=np.nan, right=np.nan
             )
-    signals = np.concatenate([signals, imu, _tracked_pose(recording, joints.stamp)], axis=1)
+    quiet = quiet_torque(robot, recording)
+    quiet = torque if quiet is None else quiet
+    signals = np.concatenate([signals, imu, _tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n)], axis=1)
     rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
     step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
@@ -99,7 +104,8 @@ def read_motions(
             velocity = derivative(position, rate)
             torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
             keep = slice(None, None, step)
-            sensed = np.where(np.isfinite(block[:, 4 * n :]), smooth[:, 4 * n :], np.nan)
+            others = slice(4 * n, 4 * n + 6)
+            sensed = np.where(np.isfinite(block[:, others]), smooth[:, others], np.nan)
             pose = sensed[:, 3:]
             motions.append(
                 RobotMotion(
@@ -113,6 +119,7 @@ def read_motions(
                     acceleration=derivative(velocity, rate)[keep].copy(),
                     torque=torque[keep].copy(),
                     torque_rate=derivative(torque, rate)[keep].copy(),
+                    quiet_torque=smooth[keep, 4 * n + 6 :].reshape(-1, n, 2),
                     imu=sensed[keep, :3],
                     pose=pose[keep].copy(),
                     tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -27,12 +27,15 @@ from pcw_description.effects.kinds import (
 from pcw_description.effects.registry import all_effects
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
+from .all_cores import on_all_cores
 from .axis_channels import kernel_arguments
 from .channel_differences import ChannelDifferences
 from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
+SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
+TURNING_ERROR = 0.01  # of columns at one direction that are put together from those at two others
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
     DescriptionEffect: ("acceleration",), ChassisForceEffect: ("speed", "v_x", "v_y"),
@@ -54,24 +57,21 @@ class _TermMaker:
 
     def terms(self) -> list[Term]:
         """All candidates."""
-        found = []
         everything: list[tuple[str, ...]] = [*((name,) for name in self.robot.caster_names), self.robot.caster_names]
+        wanted: list[tuple[Effect, tuple[str, ...], str | None]] = []
         for effect in all_effects().values():
             if isinstance(effect, ActuatorEffect):
                 continue
             targets = everything if effect.target_kind == "caster" else [(effect.target_kind,)]
             if _look_of(effect) in ("patches", "waves"):  # the floor is under all wheels
                 targets = [self.robot.caster_names]
-            for axis in effect.axes or (None,):
-                for target in targets:
-                    term = (
-                        self._joint_term(effect, target, axis)
-                        if isinstance(effect, JointTorqueEffect)
-                        else self._difference_term(effect, target, axis)
-                    )
-                    if term is not None:
-                        found.append(term)
-        return found
+            wanted += [(effect, target, axis) for axis in effect.axes or (None,) for target in targets]
+        return [term for term in on_all_cores(lambda one: self._term(*one), wanted) if term is not None]
+
+    def _term(self, effect: Effect, target: tuple[str, ...], axis: str | None) -> Term | None:
+        if isinstance(effect, JointTorqueEffect):
+            return self._joint_term(effect, target, axis)
+        return self._difference_term(effect, target, axis)
 
     # -- torques on joints --------------------------------------------------------------------------------------
 
@@ -105,12 +105,13 @@ class _TermMaker:
             target=target,
             parameters=tuple(parameters),
             shapes=shapes,
-            columns=columns,
+            columns=_once_more(shapes[0], first, columns),
             arguments=tuple(f"{axis or effect.axis}_{argument}/{name}" for argument in arguments for name in target),
             resolution={p.name: _spacing(p, self.looked) for p in effect.nonlinear_parameters if p.default is None},
             repeatable=among > 0,
             grid_size=among,
             is_exact=True,
+            noisy="force" in kernel_arguments(effect.name),
         )
 
     def _joint_columns(
@@ -123,7 +124,7 @@ class _TermMaker:
         for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
             found = np.zeros((*motion.position.shape, len(effect.linear_parameters)))
             for i in casters:
-                position, velocity, force = (s[:, i, column] for s in (motion.position, motion.velocity, motion.torque))
+                position, velocity, force = (s[:, i, column] for s in (motion.position, motion.velocity, motion.quiet_torque))
                 by_name = effect.regressor(position, velocity, force, normal[:, i], shape)
                 found[:, i, column] = np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1)
             torques.append(found)
@@ -176,11 +177,13 @@ class _TermMaker:
             return np.stack([self._difference(effect, target, axis, shape, neutral, name) for name in names], axis=2)
 
         everything = columns(shapes[0], [p.name for p in searched])
-        shown = [p for k, p in enumerate(searched) if np.abs(everything[:, :, k]).max() > 0.0]
-        if not shown:
+        seen = np.abs(everything).max(axis=(0, 1)) > 0.0
+        if not seen.any():
             return None
+        shown = [p for p, visible in zip(searched, seen, strict=True) if visible]
         names = [p.name for p in shown]
-        parameters = tuple(_linear(p, neutral[p.name]) for p in shown)
+        remembered = _once_more(shapes[0], everything[:, :, seen], lambda shape: columns(shape, names))
+        turning = next((p.name for p in effect.parameters if p.name in chosen.resolution and _is_direction(p)), None)
 
         return Term(
             effect=effect.name,
@@ -188,15 +191,29 @@ class _TermMaker:
             log_prior=effect.log_prior,
             target=target,
             shapes=shapes,
-            columns=lambda shape: columns(shape, names),
+            columns=remembered if turning is None else _Turning(remembered, turning),
             arguments=VARIABLES_OF.get(type(effect), ()),
-            parameters=parameters,
+            parameters=tuple(
+                _linear(p, neutral[p.name], room) for p, room in zip(shown, self._room(everything[:, :, seen]), strict=True)
+            ),
             # A shift of noisy samples is no column: see `ClockEffect` in robot_effects.
             is_exact=not isinstance(effect, ClockEffect),
+            is_curved=True,
             resolution=chosen.resolution,
             grid_size=chosen.among,
+            turning=turning is not None,
+            noisy=isinstance(effect, TransmissionEffect),
             once=look in ("windows", "patches"),
         )
+
+    def _room(self, columns: FloatArray) -> FloatArray:
+        """Coefficients (P,) with which columns (T, C, P) are as large as all that the description leaves in some channel."""
+        valid = self.looked.valid[:, :, None]
+        left = np.sqrt(np.sum(np.where(valid, self.differences.residual[:, :, None], 0.0) ** 2, axis=0))
+        sizes = np.sqrt(np.sum(np.where(valid, columns, 0.0) ** 2, axis=0))
+        room: FloatArray = np.min(np.where(sizes > 0.0, left / np.maximum(sizes, 1e-300), np.inf), axis=0)
+        room[np.isinf(room)] = 0.0
+        return room
 
     def _looked_for(self, effect: Effect, look: str, neutral: Mapping[str, float]) -> ChosenShapes:
         """Where and when an effect may be at work, by a first look; its other parameters at their defaults."""
@@ -266,7 +283,7 @@ class _TermMaker:
                 span = float(reach["xy".index(parameter.name)])
                 values = [-0.7 * span, 0.0, 0.7 * span]
                 resolution[parameter.name] = ("linear", 0.35 * span)
-            elif parameter.unit == "rad" and parameter.upper - parameter.lower > math.tau:
+            elif _is_direction(parameter):
                 values = [k * math.tau / DIRECTIONS for k in range(DIRECTIONS)]
                 resolution[parameter.name] = ("linear", 0.5 * math.tau / DIRECTIONS)
             elif parameter.default is not None:
@@ -275,6 +292,62 @@ class _TermMaker:
                 return None
             shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
         return ChosenShapes(tuple(shapes), 0, resolution)
+
+
+def _once_more(
+    shape: Shape, found: FloatArray, columns: Callable[[Shape], FloatArray]
+) -> Callable[[Shape], FloatArray]:
+    """Return `columns` with what was found at one shape kept until it is asked for; then the problem remembers it."""
+    known = {_frozen(shape): found}
+
+    def kept(shape: Shape) -> FloatArray:
+        return known.pop(_frozen(shape)) if _frozen(shape) in known else columns(shape)
+
+    return kept
+
+
+class _Turning:
+    """Columns of an effect that a direction or a phase shapes, of which two a quarter turn apart make all others.
+
+    That an effect is of this kind is seen by trying one direction in between; one that is not is evaluated at each.
+    """
+
+    def __init__(self, columns: Callable[[Shape], FloatArray], name: str) -> None:
+        self._columns, self._name = columns, name
+        self._turns: bool | None = None
+        self._quarters: dict[tuple[tuple[str, float], ...], tuple[FloatArray, FloatArray]] = {}
+
+    def __call__(self, shape: Shape) -> FloatArray:
+        """Columns (T, C, P) at one shape."""
+        rest = {name: value for name, value in shape.items() if name != self._name}
+        if self._turns is None:
+            self._turns = self._is_of_two(rest)
+        if not self._turns:
+            return self._columns(shape)
+        first, last = self._quarters_of(rest)
+        return math.cos(shape[self._name]) * first + math.sin(shape[self._name]) * last
+
+    def _is_of_two(self, rest: Shape) -> bool:
+        first, last = self._quarters_of(rest)
+        between = self._columns({**rest, self._name: math.pi / 4.0})
+        error = float(np.linalg.norm(math.sqrt(0.5) * (first + last) - between))
+        return error <= TURNING_ERROR * float(np.linalg.norm(between))
+
+    def _quarters_of(self, rest: Shape) -> tuple[FloatArray, FloatArray]:
+        key = _frozen(rest)
+        if key not in self._quarters:
+            first, last = (self._columns({**rest, self._name: angle}) for angle in (0.0, math.pi / 2.0))
+            self._quarters[key] = first, last
+        return self._quarters[key]
+
+
+def _frozen(shape: Shape) -> tuple[tuple[str, float], ...]:
+    return tuple(sorted(shape.items()))
+
+
+def _is_direction(parameter: EffectParameter) -> bool:
+    """Whether a parameter is an angle of which all of a turn may be."""
+    return parameter.unit == "rad" and parameter.upper - parameter.lower > math.tau
 
 
 def _look_of(effect: Effect) -> str:
@@ -298,18 +371,27 @@ def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:
     if parameter.reciprocal:
         step = 0.1 / parameter.typical
         return step, 1.0 / (step + 1.0 / neutral)
+    if parameter.squared:
+        value = SQUARED_STEP * parameter.typical
+        return value**2, value
     step = 0.1 * parameter.typical
     return step, neutral + step
 
 
-def _linear(parameter: EffectParameter, neutral: float) -> LinearParameter:
-    """The parameter as a regression coefficient: its inverse, or its distance from where it changes nothing."""
+def _linear(parameter: EffectParameter, neutral: float, room: float) -> LinearParameter:
+    """The parameter as a regression coefficient: its inverse, its square, or its distance from where it changes nothing.
+
+    It may be three times what is typical of large robots, and it may do all that there is to be done.
+    """
     if parameter.reciprocal:
         return LinearParameter(
             parameter.name, parameter.unit, 1.0 / parameter.upper - 1.0 / neutral, 1.0 / parameter.lower - 1.0 / neutral,
-            3.0 / parameter.typical, origin=neutral, reciprocal=True,
+            max(3.0 / parameter.typical, room), origin=neutral, reciprocal=True,
         )
+    if parameter.squared:
+        deviation = max(3.0 * parameter.typical**2, room)
+        return LinearParameter(parameter.name, parameter.unit, 0.0, parameter.upper**2, deviation, squared=True)
     return LinearParameter(
-        parameter.name, parameter.unit, parameter.lower - neutral, parameter.upper - neutral, 3.0 * parameter.typical,
-        origin=neutral,
+        parameter.name, parameter.unit, parameter.lower - neutral, parameter.upper - neutral,
+        max(3.0 * parameter.typical, room), origin=neutral,
     )

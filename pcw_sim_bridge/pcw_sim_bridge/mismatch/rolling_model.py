@@ -30,6 +30,7 @@ from pcw_description.augmented_object_model import dynamic_parameters
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import (
     DAMPING_TIME,
+    LAMBDA,
     LENGTH,
     scrub_torque,
     slip_of_force,
@@ -39,10 +40,12 @@ from pcw_description.differential_kinematics import rigid_motion_kernel, wheel_j
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
 
 from ..plants.support_forces import support_forces
+from .chassis_sway import ChassisSway
 from .regression_problem import Channel, FloatArray
 from .robot_motion import RobotMotion
 from .signal_filter import derivative
 
+FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
 
 
@@ -97,6 +100,44 @@ class ChannelLayout:
 
 
 @dataclasses.dataclass(frozen=True)
+class StraightTyres:
+    """The slip of tyres as a linear function of the forces on them, many times cheaper than the inverse of their curves.
+
+    Attributes:
+        tyres: numbers of the tyres that it holds for (n, TYRE_SIZE).
+        force, grip: where it is exact (T, n, 2), (T, n) [N].
+        ratio: slip ratios there (T, n, 2); of_force, of_grip: their slopes (T, n, 2, 2), (T, n, 2) [1/N].
+    """
+
+    tyres: FloatArray
+    force: FloatArray
+    grip: FloatArray
+    ratio: FloatArray
+    of_force: FloatArray
+    of_grip: FloatArray
+
+    @classmethod
+    def about(cls, numbers: ModelNumbers, force: FloatArray, grip: FloatArray) -> StraightTyres:
+        """Straighten the tyres of a model about forces (T, n, 2) and loads (T, n)."""
+        tyres = numbers.tyres.copy()
+        plain = slip_ratios(tyres, force, grip)
+        of_force = np.empty((*grip.shape, 2, 2))
+        step = FORCE_STEP * grip
+        for axis in range(2):
+            changed = force.copy()
+            changed[:, :, axis] += step
+            of_force[:, :, :, axis] = (slip_ratios(tyres, changed, grip) - plain) / step[:, :, None]
+        of_grip = (slip_ratios(tyres, force, grip + step) - plain) / step[:, :, None]
+        return cls(tyres, force, grip, plain, of_force, of_grip)
+
+    def ratios(self, force: FloatArray, grip: FloatArray) -> FloatArray:
+        """Slip ratios (T, n, 2) under other forces and loads."""
+        change = (self.of_force @ (force - self.force)[..., None])[..., 0]
+        result: FloatArray = self.ratio + change + self.of_grip * (grip - self.grip)[:, :, None]
+        return result
+
+
+@dataclasses.dataclass(frozen=True)
 class Surroundings:
     """What an effect adds along a motion besides changed numbers; None where it adds nothing.
 
@@ -106,6 +147,7 @@ class Surroundings:
         grip: factor on the friction under each wheel (T, n).
         height: of the ground under each wheel, and of what it is larger by (T, n) [m].
         pull: of gravity along base_link's axes (T, 2) [m/s^2].
+        straight: the tyres' curves straightened about where they are without a small change; None: the curves themselves.
     """
 
     torque: FloatArray | None = None
@@ -113,6 +155,7 @@ class Surroundings:
     grip: FloatArray | None = None
     height: FloatArray | None = None
     pull: FloatArray | None = None
+    straight: StraightTyres | None = None
 
 
 NOTHING = Surroundings()
@@ -133,7 +176,9 @@ class ModelNumbers:
         clock: how much later than the joints' the stamps of IMU and tracker are (2,) [s].
         spring: of the chassis over each wheel [N/m].
         lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
-            chassis leans on its springs (2,) [s^2].
+            chassis leans on its springs (2,) [s^2]; detuning: how much more of it there is per relative change of the
+            frequencies of `sway`, times that change (2,) [s^2].
+        sway: frequencies and damping of that.
     """
 
     chassis: FloatArray
@@ -154,6 +199,8 @@ class ModelNumbers:
     clock: FloatArray
     spring: float
     lean: FloatArray
+    detuning: FloatArray
+    sway: ChassisSway
 
     @property
     def total_mass(self) -> float:
@@ -189,6 +236,8 @@ class ModelNumbers:
             clock=np.zeros(2),
             spring=robot.wheel_suspension.stiffness,
             lean=np.zeros(2),
+            detuning=np.zeros(2),
+            sway=ChassisSway.of(robot),
         )
 
 
@@ -366,13 +415,12 @@ def _shared_forces(steer_axis, caster_offset, steer_angle, wrench):  # type: ign
 
 
 @compiled
-def slip_ratios(tyres, softness, force, grip):  # type: ignore[no-untyped-def]
+def slip_ratios(tyres, force, grip):  # type: ignore[no-untyped-def]
     """Steady slip ratios (T, n, 2) under forces (T, n, 2) [N] on wheels of load times friction factor grip (T, n) [N]."""
     ratio = np.empty_like(force)
     for t in range(len(force)):
         for i in range(force.shape[1]):
-            along, across = slip_of_force(tyres[i], force[t, i, 0], force[t, i, 1], grip[t, i])
-            ratio[t, i, 0], ratio[t, i, 1] = softness[i, 0] * along, softness[i, 1] * across
+            ratio[t, i, 0], ratio[t, i, 1] = slip_of_force(tyres[i], force[t, i, 0], force[t, i, 1], grip[t, i])
     return ratio
 
 
@@ -392,10 +440,19 @@ def acceleration_of(twist: FloatArray, twist_dot: FloatArray) -> FloatArray:
 
 
 def slips(
-    numbers: ModelNumbers, rate: float, speed: FloatArray, force: FloatArray, grip: FloatArray
+    numbers: ModelNumbers,
+    rate: float,
+    speed: FloatArray,
+    force: FloatArray,
+    grip: FloatArray,
+    straight: StraightTyres | None = None,
 ) -> FloatArray:
     """Slip velocities (T, n, 2) [m/s] of tyres under forces (T, n, 2), at rolling speeds and loads (T, n)."""
-    ratio = slip_ratios(numbers.tyres, numbers.softness, force, grip)
+    if straight is not None and np.array_equal(straight.tyres[:, :LENGTH], numbers.tyres[:, :LENGTH]):
+        ratio = straight.ratios(force, grip)
+    else:
+        ratio = slip_ratios(numbers.tyres, force, grip)
+    ratio = numbers.softness * ratio
     ratio = ratio - DAMPING_TIME * derivative(ratio, rate)
     result: FloatArray = speed[:, :, None] * ratio + numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
     return result
@@ -412,11 +469,15 @@ def inertial_wrench(
     return wrench
 
 
-def _leaning(numbers: ModelNumbers, twist: FloatArray, twist_dot: FloatArray) -> FloatArray | None:
+def _leaning(numbers: ModelNumbers, rate: float, twist: FloatArray, twist_dot: FloatArray) -> FloatArray | None:
     """How far the centre of mass is behind a rigid body's (T, 2) [m]; None for a rigid body."""
-    if not numbers.lean.any():
+    if not (numbers.lean.any() or numbers.detuning.any()):
         return None
-    return numbers.lean * acceleration_of(twist, twist_dot)
+    acceleration = acceleration_of(twist, twist_dot)
+    leaning = numbers.lean * numbers.sway.response(acceleration, rate)
+    if numbers.detuning.any():
+        leaning = leaning + numbers.detuning * numbers.sway.detuned(acceleration, rate)
+    return leaning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -465,7 +526,9 @@ def rolling_state(
     normal = normal_forces(numbers, steer_angle, acceleration_of(twist, felt), around.height)
     grip = np.maximum(normal if around.grip is None else normal * around.grip, 1.0)
     speed = np.abs(velocity[:, :, DRIVE] * numbers.radius)
-    spin = _scrub(numbers.tyres, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
+    patches = numbers.tyres.copy()
+    patches[:, LAMBDA] *= numbers.softness[:, 0]  # the edge of a patch slips as the tyre does
+    spin = _scrub(patches, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
     if layout.balanced:
         torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
         if around.torque is not None:
@@ -490,11 +553,11 @@ def channel_sides(
         around: what else is at work.
     """
     state = rolling_state(motion, numbers, layout, around)
-    slip = slips(numbers, motion.rate, state.speed, state.force, state.grip)
+    slip = slips(numbers, motion.rate, state.speed, state.force, state.grip, around.straight)
     slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, slip)
     twist = state.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)
-    leaning = _leaning(numbers, twist, twist_dot)
+    leaning = _leaning(numbers, motion.rate, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
         measured.append(

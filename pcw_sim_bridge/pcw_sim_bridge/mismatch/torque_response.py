@@ -19,41 +19,39 @@ from pcw_description.robot_description import DRIVE, STEER
 
 from .regression_problem import FloatArray
 from .robot_motion import RobotMotion
-from .rolling_model import ChannelLayout, ModelNumbers, RollingState, inertial_wrench, slip_ratios
+from .rolling_model import ChannelLayout, ModelNumbers, RollingState, StraightTyres, inertial_wrench
 from .signal_filter import derivative
-
-FORCE_STEP = 1e-3  # of the load on a wheel, by which the slope of its tyre's curve is taken
 
 
 class TorqueResponse:
     """The response of the channels along one motion."""
 
-    def __init__(self, motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, state: RollingState) -> None:
+    def __init__(
+        self,
+        motion: RobotMotion,
+        numbers: ModelNumbers,
+        layout: ChannelLayout,
+        state: RollingState,
+        straight: StraightTyres,
+    ) -> None:
         """Linearise.
 
         Args:
             motion: a true motion.
             numbers: of the model.
             layout: which channels there are.
-            state: how the wheels roll along the motion.
+            state: how the wheels roll along the motion; straight: its tyres.
         """
         self.layout = layout
         count, n = state.force.shape[:2]
-        steer_angle, force, grip = state.steer_angle, state.force, state.grip
+        steer_angle = state.steer_angle
         # Forces in the wheel frames per joint torque (n, 2, 2).
         of_torque = np.zeros((n, 2, 2))
         offset_x, offset_y = numbers.caster_offset[:, 0], numbers.caster_offset[:, 1]
         of_torque[:, 0, DRIVE] = 1.0 / numbers.radius
         of_torque[:, 1, DRIVE] = offset_y / offset_x / numbers.radius
         of_torque[:, 1, STEER] = -1.0 / offset_x
-        plain = slip_ratios(numbers.tyres, numbers.softness, force, grip)
-        slopes = np.empty((count, n, 2, 2))
-        for axis in range(2):
-            changed = force.copy()
-            changed[:, :, axis] += FORCE_STEP * grip
-            slopes[:, :, :, axis] = (slip_ratios(numbers.tyres, numbers.softness, changed, grip) - plain) / (
-                FORCE_STEP * grip[:, :, None]
-            )
+        slopes = numbers.softness[:, :, None] * straight.of_force
         self._ratio_of_torque = slopes @ of_torque
         self._derivative = _derivative_matrix(count, motion.rate)
         damped = sparse.eye_array(count) - DAMPING_TIME * self._derivative

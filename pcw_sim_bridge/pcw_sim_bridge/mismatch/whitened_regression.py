@@ -90,38 +90,54 @@ class _ScanGroup:
 
 
 class _ColumnBank:
-    """Whitened columns side by side, and their Gram matrices over all rows and by block.
-
-    Attributes:
-        by_block: (blocks, K, K); total: (K, K).
-    """
+    """Whitened columns side by side, and their Gram matrices over all rows and by block; there is room for more to come."""
 
     def __init__(self, blocks: Sequence[slice], rows: int) -> None:
         self._blocks = blocks
-        self._data: FloatArray = np.zeros((rows, 0))
-        self.by_block: FloatArray = np.zeros((len(blocks), 0, 0))
-        self.total: FloatArray = np.zeros((0, 0))
+        self._count = 0
+        self._data: FloatArray = np.empty((rows, 0))
+        self._by_block: FloatArray = np.empty((len(blocks), 0, 0))
+        self._total: FloatArray = np.empty((0, 0))
+
+    @property
+    def by_block(self) -> FloatArray:
+        """Gram matrices of the blocks (blocks, K, K)."""
+        return self._by_block[:, : self._count, : self._count]
+
+    @property
+    def total(self) -> FloatArray:
+        """Gram matrix of all rows (K, K)."""
+        return self._total[: self._count, : self._count]
 
     def add(self, columns: FloatArray) -> slice:
         """Add columns (R, m); return their places."""
-        before = self._data.shape[1]
-        self._data = np.concatenate([self._data, columns], axis=1)
-        count = self._data.shape[1]
-        grown = np.empty((len(self._blocks), count, count))
-        grown[:, :before, :before] = self.by_block
+        before, count = self._count, self._count + columns.shape[1]
+        if count > self._data.shape[1]:
+            self._make_room(max(count, 2 * before))
+        self._count = count
+        self._data[:, before:count] = columns
         for k, piece in enumerate(self._blocks):
-            grown[k, :, before:] = self._data[piece].T @ columns[piece]
-        grown[:, before:, :before] = grown[:, :before, before:].transpose(0, 2, 1)
-        self.by_block = grown
-        self.total = grown.sum(axis=0)
+            self._by_block[k, :count, before:count] = self._data[piece, :count].T @ columns[piece]
+        new = self._by_block[:, :before, before:count]
+        self._by_block[:, before:count, :before] = new.transpose(0, 2, 1)
+        self._total[:count, before:count] = self._by_block[:, :count, before:count].sum(axis=0)
+        self._total[before:count, :before] = self._total[:before, before:count].T
         return slice(before, count)
+
+    def _make_room(self, size: int) -> None:
+        count = self._count
+        data = np.empty((self._data.shape[0], size))
+        by_block, total = np.empty((len(self._blocks), size, size)), np.empty((size, size))
+        data[:, :count] = self._data[:, :count]
+        by_block[:, :count, :count], total[:count, :count] = self.by_block, self.total
+        self._data, self._by_block, self._total = data, by_block, total
 
     def rescale(self, factors: FloatArray) -> None:
         """Multiply the rows of every block by a factor (blocks,)."""
         for piece, factor in zip(self._blocks, factors, strict=True):
-            self._data[piece] *= factor
-        self.by_block *= factors[:, None, None] ** 2
-        self.total = self.by_block.sum(axis=0)
+            self._data[piece, : self._count] *= factor
+        self.by_block[...] *= factors[:, None, None] ** 2
+        self.total[...] = self.by_block.sum(axis=0)
 
     def columns(self, places: IntArray) -> FloatArray:
         """Return columns (R, m) by their places."""
@@ -180,7 +196,8 @@ class WhitenedRegression:
         """
         self.problem = problem
         self.noise = noise
-        usable = noise.usable(problem.valid, problem.segment)
+        self._weights, self._block = weights, block
+        usable = problem.valid
         samples = np.arange(usable.size).reshape(usable.shape)
         self._flat = samples[usable] if block is not None else samples.T[usable.T]
         self._root = np.sqrt(weights.ravel()[self._flat])
@@ -206,6 +223,10 @@ class WhitenedRegression:
         white = self.noise.whiten(values, self.problem.valid, self.problem.segment)
         flat = white.reshape(-1, *values.shape[2:])[self._flat]
         return flat * self._root.reshape(-1, *(1,) * (flat.ndim - 1))
+
+    def moved(self, problem: RegressionProblem) -> WhitenedRegression:
+        """Whiten the same problem, exact elsewhere, by the same noise."""
+        return WhitenedRegression(problem, self.noise, self._weights, self._block)
 
     def rescale(self, deviations: FloatArray) -> None:
         """Take the noise of each channel to have these deviations (C,)."""
@@ -444,14 +465,19 @@ class WhitenedRegression:
 
     def within_bounds(self, fit: Fit) -> bool:
         """Whether every parameter of a fit lies within its bounds."""
-        position = self.nuisance.shape[1]
+        return all(self.each_within_bounds(fit))
+
+    def each_within_bounds(self, fit: Fit) -> list[bool]:
+        """Whether all parameters of an instance lie within their bounds, per instance."""
+        position, within = self.nuisance.shape[1], []
         for instance in fit.instances:
             parameters = self.problem.terms[instance.term].parameters
-            for index in instance.active:
-                if not parameters[index].lower <= fit.mean[position] <= parameters[index].upper:
-                    return False
-                position += 1
-        return True
+            means = fit.mean[position : position + len(instance.active)]
+            within.append(
+                all(parameters[k].lower <= mean <= parameters[k].upper for k, mean in zip(instance.active, means, strict=True))
+            )
+            position += len(instance.active)
+        return within
 
     def with_shape(self, instance: Instance, shape: Shape) -> Instance:
         """Return the instance with another shape."""

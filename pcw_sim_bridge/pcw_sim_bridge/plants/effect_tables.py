@@ -99,8 +99,8 @@ class EffectTables:
         if not self.has_gears:
             return joint_position.copy(), joint_velocity.copy()
         return (
-            _as_joint_motion(self.gears, self.coupling, self.gear_state[:, :, ANGLE], joint_position),
-            _as_joint_motion(self.gears, self.coupling, self.gear_state[:, :, RATE], joint_velocity),
+            as_joint_motion(self.gears, self.coupling, self.gear_state[:, :, ANGLE], joint_position),
+            as_joint_motion(self.gears, self.coupling, self.gear_state[:, :, RATE], joint_velocity),
         )
 
     def _collect_joint_torques(self, robot: RobotDescription) -> None:
@@ -161,7 +161,7 @@ class EffectTables:
 
 
 @compiled
-def _as_joint_motion(gears, coupling, motor, joint):  # type: ignore[no-untyped-def]
+def as_joint_motion(gears, coupling, motor, joint):  # type: ignore[no-untyped-def]
     """Return the joint angles or rates (n, 2) that rigid gears would have with these motors behind the gears that are not."""
     found = np.empty_like(joint)
     for i in range(len(joint)):

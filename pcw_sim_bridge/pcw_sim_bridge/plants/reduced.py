@@ -75,7 +75,7 @@ from .caster_arrays import (
     caster_numbers,
 )
 from .drivetrain import joint_torques, motor_torques, turn_motors
-from .effect_tables import ANGLE, RATE, EffectTables
+from .effect_tables import ANGLE, RATE, EffectTables, as_joint_motion
 from .plant import PlantError, PlantState, gravity_in_base
 from .support_forces import support_forces
 from .surroundings import chassis_wrench, ground_under
@@ -320,6 +320,14 @@ def _set_motion(body, wheels, effects, twist, position, velocity):  # type: igno
         for axis in range(2):
             wheels[i, RHO + axis] = position[i, axis]
             wheels[i, RHO_DOT + axis] = velocity[i, axis]
+    _rigid_motors(effects, position, velocity)
+
+
+@compiled
+def _rigid_motors(effects, position, velocity):  # type: ignore[no-untyped-def]
+    """Set the motors behind gears as rigid gears would have them."""
+    for i in range(len(position)):
+        for axis in range(2):
             first, second = effects.coupling[i, axis, 0], effects.coupling[i, axis, 1]
             effects.gear_state[i, axis, ANGLE] = first * position[i, 0] + second * position[i, 1]
             effects.gear_state[i, axis, RATE] = first * velocity[i, 0] + second * velocity[i, 1]
@@ -350,10 +358,20 @@ def _roll_out(  # type: ignore[no-untyped-def]
                 )
                 restart[:] = twist[w, 1] + body[_VX : _OMEGA + 1] - rolled
                 body[_X : _YAW + 1] = pose[w, 1]
+                # Gears stay wound up as the lead left them.
+                wound = effects.gear_state[:, :, : RATE + 1].copy()
+                _rigid_motors(effects, wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy())
+                wound -= effects.gear_state[:, :, : RATE + 1]
                 _set_motion(body, wheels, effects, restart, position[w, 1], velocity[w, 1])
+                effects.gear_state[:, :, : RATE + 1] += wound
             if mark < len(marks) and row == lead + marks[mark]:
                 bodies[w, mark] = body[: _OMEGA + 1]
-                joints[w, mark] = wheels[:, RHO : PHI_DOT + 1]
+                joints[w, mark, :, :2] = as_joint_motion(
+                    effects.gears, effects.coupling, effects.gear_state[:, :, ANGLE], wheels[:, RHO : PHI + 1]
+                )
+                joints[w, mark, :, 2:] = as_joint_motion(
+                    effects.gears, effects.coupling, effects.gear_state[:, :, RATE], wheels[:, RHO_DOT : PHI_DOT + 1]
+                )
                 mark += 1
             if row == rows:
                 break
@@ -483,7 +501,8 @@ class ReducedPlant:
             marks: rows after the lead at which the state is wanted (K,), increasing, at most L - lead.
 
         Returns:
-            Pose and twist (W, K, 6), and joint positions and velocities (W, K, n, 2, 2), position first.
+            Pose and twist (W, K, 6), and what encoders on the motors would read: joint positions and velocities
+            (W, K, n, 2, 2), position first.
 
         Raises:
             PlantError: a torque is NaN or infinite.

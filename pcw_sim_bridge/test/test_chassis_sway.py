@@ -1,0 +1,72 @@
+"""The chassis on its springs: the resonator of the channel model, and what it saves on a robot in space."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pcw_description import load_robot
+from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
+from pcw_sim_bridge.mismatch.noise_model import robust_deviation, white_noise_model
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.whitened_regression import WhitenedRegression
+from pcw_sim_bridge.simulated_run import record_run
+
+THESIS = load_robot("thesis")
+RATE = 200.0
+
+
+def amplitude(frequency: float, sway: ChassisSway) -> float:
+    """Of the response along x to a sine of amplitude 1, once it has settled."""
+    time = np.arange(0.0, 30.0, 1.0 / RATE)
+    sine = np.sin(frequency * time)
+    response = sway.response(np.column_stack([sine, sine]), RATE)[:, 0]
+    return float(np.abs(response[len(time) // 2 :]).max())
+
+
+def test_it_follows_slow_motions_and_resonates_at_its_frequency():
+    sway = ChassisSway.of(THESIS)
+    frequency, damping = float(sway.frequency[0]), float(sway.damping[0])
+    assert amplitude(0.02 * frequency, sway) == pytest.approx(1.0, abs=0.002)
+    assert amplitude(frequency, sway) == pytest.approx(1.0 / (2.0 * damping), rel=0.01)
+    # What is beyond half the sampling rate follows at once.
+    stiff = dataclasses.replace(sway, frequency=np.full(2, 2.0 * math.pi * RATE))
+    assert amplitude(frequency, stiff) == pytest.approx(1.0, abs=0.002)
+
+
+def test_the_detuned_response_is_a_derivative():
+    sway = ChassisSway.of(THESIS)
+    moves = np.cumsum(np.random.default_rng(0).standard_normal((2000, 2)), axis=0)
+    change = sway.response(moves, RATE, 0.01) - sway.response(moves, RATE)
+    error = change - 0.01 * sway.detuned(moves, RATE)
+    assert np.std(error) < 0.05 * np.std(change)
+
+
+def test_a_robot_that_its_springs_do_not_hold_upright_does_not_sway():
+    suspension = dataclasses.replace(THESIS.wheel_suspension, stiffness=100.0)
+    assert ChassisSway.of(dataclasses.replace(THESIS, suspension=suspension)).lean.tolist() == [0.0, 0.0]
+
+
+def test_with_it_a_robot_in_space_leaves_far_less(tmp_path: Path):
+    """Residual forces, re-tuned, of a run in PyBullet with and without the numbers of the sway."""
+
+    def twist(time: float) -> np.ndarray:
+        return np.array([0.4 * math.sin(2.0 * time), 0.3 * math.sin(3.1 * time), 0.5 * math.sin(2.3 * time)])
+
+    record_run(THESIS, twist, 15.0, 5, tmp_path / "run", "pybullet")
+    recording = RobotSubject(THESIS).open(tmp_path / "run", "fit", {}).recording
+    problem = RobotProblemBuilder(THESIS, [recording]).build(with_terms=False)
+    rigid = dataclasses.replace(problem, nuisances=tuple(n for n in problem.nuisances if "suspension" not in n.name))
+    left = []
+    for one in (problem, rigid):
+        white, block = white_noise_model(one.residual, one.valid), np.zeros(len(one.time), dtype=np.int64)
+        regression = WhitenedRegression(one, white, np.ones_like(one.residual), block)
+        residual = regression.unwhitened_residual(regression.fit(()))
+        left.append(np.array([robust_deviation(residual[one.valid[:, k], k]) for k in range(2)]))
+    print(f"residual forces {left[0]} N with it, {left[1]} N without")
+    assert np.linalg.norm(left[0]) < 0.75 * np.linalg.norm(left[1])

@@ -1,0 +1,176 @@
+"""The regression problem where it is exact, and the noise of recordings with gaps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, SelectionSettings
+from pcw_sim_bridge.mismatch.noise_model import NoiseModel
+from pcw_sim_bridge.mismatch.regression_problem import (
+    Channel,
+    LinearParameter,
+    Nuisance,
+    RegressionProblem,
+    SizedTerm,
+    Term,
+)
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
+
+SAMPLES, RATE = 600, 50.0
+NOISE = 0.01
+
+
+def one_channel(measured: np.ndarray, residual: np.ndarray, **more: object) -> RegressionProblem:
+    """A problem of one channel (T,), without a gap."""
+    samples = len(residual)
+    time = np.arange(samples) / RATE
+    fields = {
+        "channels": (Channel("axis_force", "N"),),
+        "time": time,
+        "segment": np.zeros(samples, dtype=np.int64),
+        "recording": np.zeros(samples, dtype=np.int64),
+        "rate": RATE,
+        "measured": measured[:, None],
+        "residual": residual[:, None],
+        "valid": np.ones((samples, 1), dtype=bool),
+        "variables": {"time": time},
+    }
+    return RegressionProblem(**fields, **more)
+
+
+def curved_problem(size: float, change: float) -> RegressionProblem:
+    """A quadratic effect of that size, and a number that is off by that change and scales what the effect does."""
+    rng = np.random.default_rng(0)
+    time = np.arange(SAMPLES) / RATE
+    works, moves = np.sin(2.1 * time), np.cos(0.7 * time)
+
+    def model(x: float, number: float) -> np.ndarray:
+        return (x**2 * works * (1.0 + 5.0 * number) + number * moves)[:, None]
+
+    measured = model(size, change) + NOISE * rng.standard_normal((SAMPLES, 1))
+
+    def exact(changes, sizes):
+        x = float(sizes[0].coefficients[0]) if sizes else 0.0
+        return measured - model(x, changes.get("number", 0.0)), ["number"]
+
+    def derive(changes, sizes):
+        x = float(sizes[0].coefficients[0]) if sizes else 0.0
+        return {"number": (model(x, 1e-6) - model(x, 0.0)) / 1e-6}
+
+    return one_channel(
+        measured[:, 0],
+        measured[:, 0],
+        nuisances=(Nuisance("number", "1", 0.0, 0.05, moves[:, None]),),
+        terms=(
+            Term(
+                "curved", ("axis",), (LinearParameter("size", "1", 0.0, 100.0, 3.0),), ({},),
+                # The slope at a small size is no measure of a large one.
+                lambda shape: (0.2 * works)[:, None, None], is_exact=True, is_curved=True,
+            ),
+        ),
+        exact=exact,
+        derive=derive,
+    )  # fmt: skip
+
+
+def test_an_effect_out_of_proportion_comes_out_with_its_size():
+    """The slope at the description is wrong by a factor of ten; the problem made exact finds size and number."""
+    search = EffectSearch(curved_problem(2.0, 0.04), np.random.default_rng(0))
+    instances = search.made_exact((Instance(0, (), (0,)),))
+    fit = search.whiten_at(search.residual_of(instances)).fit(instances)
+    # Noise leaves 0.0008 and 0.0003 of them open.
+    assert fit.mean[0] == pytest.approx(0.04, abs=0.003)
+    assert fit.mean[1] == pytest.approx(2.0, rel=0.01)
+    assert search.problem.powers == {(0, (), 0): pytest.approx(2.0, abs=0.01)}
+    assert search.channel_deviations(search.residual_of(instances)) == pytest.approx([NOISE], rel=0.1)
+
+
+def test_a_secant_is_exact_with_the_effect_and_without_it():
+    """With the coefficient it was taken at, and with none, the residual is that of the model."""
+    problem = curved_problem(2.0, 0.0)
+    there = problem.exact_at({"number": 0.0}, [SizedTerm(0, (), np.array([1.5]))])
+    column = there.columns(0, ())[..., 0]
+    exact = problem.exact
+    assert exact is not None
+    assert there.residual - 1.5 * column == pytest.approx(exact({}, [SizedTerm(0, (), np.array([1.5]))])[0])
+    assert there.residual == pytest.approx(exact({}, [])[0])
+
+
+def test_what_is_at_the_description_stays_there_without_a_model():
+    """A problem whose columns are exact everywhere is never moved."""
+    problem = dataclasses.replace(curved_problem(2.0, 0.0), exact=None, derive=None)
+    assert problem.exact_at({"number": 0.1}, ()) is problem
+    assert problem.derived() is problem
+
+
+def test_samples_after_gaps_are_whitened_as_well_as_those_before_them():
+    """Coloured noise in runs of seven samples: each of them comes out white, and none is left out."""
+    taps = np.array([1.0, -0.8, 0.15])
+    rng = np.random.default_rng(1)
+    noise = signal.lfilter([1.0], taps, rng.standard_normal(70_000))[:, None]
+    valid = (np.arange(len(noise)) % 9 < 7)[:, None]
+    garbage = np.where(valid, noise, 1e6)
+    white = NoiseModel(taps[None], np.eye(1)).whiten(garbage, valid, np.zeros(len(noise), dtype=np.int64))[:, 0]
+    assert (white[~valid[:, 0]] == 0.0).all()
+    runs = white[: 9 * (len(white) // 9)].reshape(-1, 9)[:, :7]
+    assert np.cov(runs.T) == pytest.approx(np.eye(7), abs=0.06)
+
+
+def linear_problem(residual: np.ndarray, terms: dict[str, tuple[np.ndarray, float]], once: bool = False) -> RegressionProblem:
+    """One channel of a measured side of size 1 and more, and terms by name: column (T,) and largest coefficient."""
+    time = np.arange(len(residual)) / RATE
+    return one_channel(
+        residual + 10.0 * np.sin(time),
+        residual,
+        nuisances=(Nuisance("number", "1", 0.0, 1e-3, np.cos(0.3 * time)[:, None]),),
+        terms=tuple(
+            Term(name, ("axis",), (LinearParameter("size", "1", -limit, limit, 30.0),), ({},),
+                 lambda shape, column=column: column[:, None, None], once=once)
+            for name, (column, limit) in terms.items()
+        ),
+        scale_deviation=0.01,
+    )  # fmt: skip
+
+
+def chosen(problem: RegressionProblem) -> list[str]:
+    """Names that pruning leaves of all terms at once."""
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    instances = tuple(Instance(index, (), (0,)) for index in range(len(problem.terms)))
+    regression = search.whiten_at(search.residual_of(instances))
+    return [problem.terms[i.term].effect for i in search.prune(regression, instances, 9.0).fit.instances]
+
+
+def test_terms_that_undo_each_other_are_dropped_together():
+    """Either without the other would be far off; both do less than the model's own error, so neither is a finding."""
+    time = np.arange(3000) / RATE
+    rng = np.random.default_rng(2)
+    force, trace = np.sin(time), np.sin(2.9 * time)
+    left = 0.05 * trace + 0.01 * rng.standard_normal(len(time))
+    both = {"stronger": (force, 100.0), "heavier": (-force + 0.01 * trace, 100.0)}
+    assert chosen(linear_problem(left, both)) == []
+    # The same pair where the other half of one is at work alone: that is more than any error of the model.
+    assert chosen(linear_problem(left + 2.0 * force, both)) == ["stronger"]
+
+
+def test_what_happens_once_must_stand_above_other_bursts():
+    """The model errs in bursts: a shape that fits one of five is no event, and it is one where there is no other."""
+    rng = np.random.default_rng(3)
+    noise = 0.01 * rng.standard_normal(3000)
+    bursts = np.zeros((5, 3000))
+    for k in range(5):
+        bursts[k, 300 + 500 * k : 320 + 500 * k] = rng.standard_normal(20)
+    event = {"event": (bursts[2], 100.0)}
+    assert chosen(linear_problem(noise + bursts.sum(axis=0), event, once=True)) == []
+    assert chosen(linear_problem(noise + bursts[2], event, once=True)) == ["event"]
+
+
+def test_a_number_that_cannot_be_explains_nothing():
+    """A friction that drives is none."""
+    time = np.arange(3000) / RATE
+    left = 2.0 * np.sin(time) + 0.01 * np.random.default_rng(4).standard_normal(len(time))
+    assert chosen(linear_problem(left, {"possible": (np.sin(time), 3.0)})) == ["possible"]
+    assert chosen(linear_problem(left, {"impossible": (np.sin(time), 1.0)})) == []
