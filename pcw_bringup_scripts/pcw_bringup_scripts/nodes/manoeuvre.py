@@ -16,7 +16,14 @@ from std_srvs.srv import SetBool
 
 from pcw_control.excitation import EXCITATIONS, read_excitation
 from pcw_description.errors import PcwError
-from pcw_description.nodes.node_tools import COMMAND_SOURCE, SENSOR, declare, run_node, stamp_to_ns, wait_until_heard
+from pcw_description.nodes.node_tools import (
+    COMMAND_SOURCE,
+    SENSOR,
+    declare,
+    run_node,
+    stamp_to_ns,
+    wait_until_heard,
+)
 from pcw_description.robot_file import load_robot
 
 # What has to be heard by a node of `wait_for` before the simulation starts, if the node listens to it at all.
