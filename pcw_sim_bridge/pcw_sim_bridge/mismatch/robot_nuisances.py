@@ -73,9 +73,11 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
     """Return all of these that are numbers of the channel model."""
     found = []
     layout = differences.model.layout
+    sampling = max(motion.sampling for motion in differences.motions)
+    # Nobody knows either which headings a simulation took its rates from, or how a drive makes its angles from its counts.
+    found.append(VariedNumber("heading_lead", "s", 0.0, 0.5 * sampling, _entry("heading_lead")))
     if layout.balanced:
         # A drive reports the torque of some instant within its own cycle; nobody knows which.
-        sampling = max(motion.sampling for motion in differences.motions)
         found.append(VariedNumber("torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
     found += _suspension(differences)
     deviations = list(_geometry(robot))

@@ -9,7 +9,10 @@
 with H the same filter on both sides and P = 1 - A A^+. Each joint's own balance gives the force at its contact,
 
     r F_x = tau_rho - I_rho rho_ddot - J_rp phi_ddot
-    b_x F_y - b_y F_x = m c x a_c + I sigma_dot + J_pp phi_ddot + J_rp rho_ddot - tau_phi - M_scrub
+    b_x F_y - b_y F_x = m c x a_c + I sigma_dot + J_pp phi_ddot + J_rp rho_ddot - tau_phi - M_scrub - (N b - m g c) x t
+
+A chassis that leans on its springs leans its steering axes: with t the vertical in its horizontal axes, the contact is where
+the wheel is lowest, b_x = b_x0 - r t_x in the wheel's frame, and weights turn the steering.
 
 and the tyre under that force slips: eps = |V_w| lambda(F) + L d lambda / dt, the relaxed slip solved for eps. The robot's
 twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a missing force of a tenth of
@@ -173,12 +176,15 @@ class ModelNumbers:
         imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
         tyres: numbers of the tyres (n, TYRE_SIZE); softness: slip at the contact per slip of these (n, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
+        heading_lead: how much later the headings were that belong to the rates beside them [s]. A simulation in steps that
+            makes its rates from one set of angles, and the next angles from those rates, is half a step off.
         clock: how much later than the joints' the stamps of IMU and tracker are (2,) [s].
         spring: of the chassis over each wheel [N/m].
         lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
             chassis leans on its springs (2,) [s^2]; detuning: how much more of it there is per relative change of the
             frequencies of `sway`, times that change (2,) [s^2].
-        sway: frequencies and damping of that.
+        sway: frequencies and damping of that. A chassis that leans when it accelerates does so too where its wheels do not
+            carry it at its centre of mass.
     """
 
     chassis: FloatArray
@@ -196,6 +202,7 @@ class ModelNumbers:
     tyres: FloatArray
     softness: FloatArray
     torque_lag: float
+    heading_lead: float
     clock: FloatArray
     spring: float
     lean: FloatArray
@@ -233,6 +240,7 @@ class ModelNumbers:
             tyres=np.array([tyre_parameters(tyre) for tyre in robot.tyres]),
             softness=np.ones((robot.n, 2)),
             torque_lag=0.0,
+            heading_lead=0.0,
             clock=np.zeros(2),
             spring=robot.wheel_suspension.stiffness,
             lean=np.zeros(2),
@@ -242,41 +250,60 @@ class ModelNumbers:
 
 
 @compiled
-def _rigid_motions(steer_axis, caster_offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
+def _rigid_motions(steer_axis, offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
     twist = np.empty((len(sensed), 3))
     contradiction = np.empty_like(sensed)
     for t in range(len(sensed)):
-        twist[t], contradiction[t], _ = rigid_motion_kernel(steer_axis, caster_offset, steer_angle[t], sensed[t])
+        twist[t], contradiction[t], _ = rigid_motion_kernel(steer_axis, offset[t], steer_angle[t], sensed[t])
     return twist, contradiction
 
 
-def rigid_motions(numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Split velocities (T, n, 2) in the wheel frames into the twist A^+ w (T, 3) and what contradicts it (T, n, 2)."""
+def rigid_motions(
+    numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray, offset: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Split velocities (T, n, 2) in the wheel frames into the twist A^+ w (T, 3) and what contradicts it (T, n, 2).
+
+    Args:
+        offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m]; None: the described ones.
+    """
     found: tuple[FloatArray, FloatArray] = _rigid_motions(
-        numbers.steer_axis, numbers.caster_offset, np.ascontiguousarray(steer_angle), velocity
-    )
+        numbers.steer_axis, _offsets(numbers, steer_angle) if offset is None else offset,
+        np.ascontiguousarray(steer_angle), velocity,
+    )  # fmt: skip
     return found
 
 
-def rolling_velocities(numbers: ModelNumbers, velocity: FloatArray) -> FloatArray:
+def _offsets(numbers: ModelNumbers, steer_angle: FloatArray, tilt: FloatArray | None = None) -> FloatArray:
+    """Offsets (T, n, 2) [m] of the contacts from the steering axes, of a chassis that is tilted so (T, 2); None: upright."""
+    offsets = np.empty((*steer_angle.shape, 2))
+    offsets[:] = numbers.caster_offset
+    if tilt is not None:
+        ahead = np.cos(steer_angle) * tilt[:, :1] + np.sin(steer_angle) * tilt[:, 1:]
+        offsets[:, :, 0] -= numbers.radius * ahead
+    return offsets
+
+
+def rolling_velocities(numbers: ModelNumbers, velocity: FloatArray, offset: FloatArray | None = None) -> FloatArray:
     """Velocities B q_dot (T, n, 2) of the wheel centres in the wheel frames that joint rates (T, n, 2) make without slip."""
-    offset_x, offset_y = numbers.caster_offset[:, 0], numbers.caster_offset[:, 1]
+    offset_x, offset_y = np.moveaxis(numbers.caster_offset if offset is None else offset, -1, 0)
     along = numbers.radius * velocity[:, :, DRIVE] + offset_y * velocity[:, :, STEER]
     return np.stack([along, -offset_x * velocity[:, :, STEER]], axis=2)
 
 
-def twists(numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
+def twists(
+    numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray, offset: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Wheels' twist (T, 3) and what of each wheel's motion contradicts it (T, n, 2) [m/s], of joint rates (T, n, 2)."""
-    return rigid_motions(numbers, steer_angle, rolling_velocities(numbers, velocity))
+    return rigid_motions(numbers, steer_angle, rolling_velocities(numbers, velocity, offset), offset)
 
 
 @compiled
 def _contact_forces(  # type: ignore[no-untyped-def]
-    modules, steer_axis, caster_offset, radius, steer_angle, velocity, acceleration, torque, spin, twist, twist_dot
+    modules, steer_axis, offset, radius, steer_angle, velocity, acceleration, torque, spin, twist, twist_dot, normal, tilt
 ):
     """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N].
 
-    radius, spin: rolling radius [m] and torque of the ground about the vertical [N m] of each wheel (T, n).
+    radius, spin, normal: rolling radius [m], torque of the ground about the vertical [N m] and load [N] of each wheel (T, n).
     """
     force = np.empty_like(torque)
     for t in range(len(torque)):
@@ -315,20 +342,24 @@ def _contact_forces(  # type: ignore[no-untyped-def]
                 - torque[t, i, 1]
                 - spin[t, i]
             )
+            ahead, aside = tilt[t, 0] * c + tilt[t, 1] * s, tilt[t, 1] * c - tilt[t, 0] * s
+            weight = m * GRAVITY
+            turning -= (normal[t, i] * offset[t, i, 0] - weight * cx) * aside
+            turning += (normal[t, i] * offset[t, i, 1] - weight * cy) * ahead
             force[t, i, 0] = along
-            force[t, i, 1] = (turning + caster_offset[i, 1] * along) / caster_offset[i, 0]
+            force[t, i, 1] = (turning + offset[t, i, 1] * along) / offset[t, i, 0]
     return force
 
 
 @compiled
-def _wrench_of(steer_axis, caster_offset, steer_angle, force, spin):  # type: ignore[no-untyped-def]
+def _wrench_of(steer_axis, offset, steer_angle, force, spin):  # type: ignore[no-untyped-def]
     """Wrench on the base (T, 3) of contact forces (T, n, 2) and of torques about the vertical (T, n)."""
     wrench = np.zeros((len(force), 3))
     for t in range(len(force)):
         for i in range(steer_angle.shape[1]):
             c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
             fx, fy = force[t, i, 0], force[t, i, 1]
-            bx, by = caster_offset[i, 0], caster_offset[i, 1]
+            bx, by = offset[t, i, 0], offset[t, i, 1]
             px = steer_axis[i, 0] + bx * c - by * s
             py = steer_axis[i, 1] + bx * s + by * c
             gx, gy = c * fx - s * fy, s * fx + c * fy
@@ -365,9 +396,19 @@ def _inertial_wrench(  # type: ignore[no-untyped-def]
     return wrench
 
 
+def mass_centre(numbers: ModelNumbers, steer_angle: FloatArray) -> FloatArray:
+    """Centre of mass of chassis and modules (T, 2) [m], the wheels at their headings (T, n)."""
+    chassis, modules = numbers.chassis, numbers.modules
+    c, s = np.cos(steer_angle), np.sin(steer_angle)
+    lever_x, lever_y = modules[:, 1] * c - modules[:, 2] * s, modules[:, 1] * s + modules[:, 2] * c
+    moment = chassis[0] * chassis[1:3] + modules[:, 0] @ numbers.steer_axis
+    centre: FloatArray = (moment + np.stack([lever_x @ modules[:, 0], lever_y @ modules[:, 0]], axis=1)) / numbers.total_mass
+    return centre
+
+
 @compiled
-def _normal_forces(mass, com, spring, steer_axis, caster_offset, steer_angle, acceleration, height):  # type: ignore[no-untyped-def]
-    """Quasi-static normal forces (T, n) [N] from the accelerations (T, 2), on ground of a height (T, n)."""
+def _normal_forces(mass, com, height_of_mass, spring, steer_axis, caster_offset, steer_angle, acceleration, height):  # type: ignore[no-untyped-def]
+    """Quasi-static normal forces (T, n) [N] from centre of mass and accelerations (T, 2), on ground of a height (T, n)."""
     normal = np.empty_like(steer_angle)
     centre = np.empty_like(steer_axis)
     for t in range(len(steer_angle)):
@@ -375,8 +416,8 @@ def _normal_forces(mass, com, spring, steer_axis, caster_offset, steer_angle, ac
             c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
             centre[i, 0] = steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
             centre[i, 1] = steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
-        moment_x = mass * (GRAVITY * com[0] - com[2] * acceleration[t, 0])
-        moment_y = mass * (GRAVITY * com[1] - com[2] * acceleration[t, 1])
+        moment_x = mass * (GRAVITY * com[t, 0] - height_of_mass * acceleration[t, 0])
+        moment_y = mass * (GRAVITY * com[t, 1] - height_of_mass * acceleration[t, 1])
         support_forces(mass * GRAVITY, moment_x, moment_y, spring, centre, height[t], normal[t])
     return normal
 
@@ -390,14 +431,11 @@ def normal_forces(
         acceleration: of base_link in its own axes (T, 2 or more).
         height: of the ground under each wheel (T, n) [m]; None where it is level.
     """
-    chassis, modules = numbers.chassis, numbers.modules
-    mass = numbers.total_mass
-    centre = (chassis[0] * chassis[1:3] + (modules[:, :1] * numbers.steer_axis).sum(axis=0)) / mass
     # On level ground the load does not depend on how stiff equal springs are, and rigid ones know no other.
     height = np.zeros(steer_angle.shape) if height is None or numbers.spring == 0.0 else height
     forces: FloatArray = _normal_forces(
-        mass, np.array([*centre, numbers.height_of_mass]), numbers.spring or 1.0, numbers.steer_axis,
-        numbers.caster_offset, steer_angle, acceleration, height,
+        numbers.total_mass, mass_centre(numbers, steer_angle), numbers.height_of_mass, numbers.spring or 1.0,
+        numbers.steer_axis, numbers.caster_offset, steer_angle, acceleration, height,
     )  # fmt: skip
     return forces
 
@@ -470,7 +508,7 @@ def inertial_wrench(
 
 
 def _leaning(numbers: ModelNumbers, rate: float, twist: FloatArray, twist_dot: FloatArray) -> FloatArray | None:
-    """How far the centre of mass is behind a rigid body's (T, 2) [m]; None for a rigid body."""
+    """How far the centre of mass is behind a rigid body's as it accelerates (T, 2) [m]; None for a rigid body."""
     if not (numbers.lean.any() or numbers.detuning.any()):
         return None
     acceleration = acceleration_of(twist, twist_dot)
@@ -480,12 +518,29 @@ def _leaning(numbers: ModelNumbers, rate: float, twist: FloatArray, twist_dot: F
     return leaning
 
 
+def _tilt(
+    numbers: ModelNumbers, rate: float, steer_angle: FloatArray, twist: FloatArray, felt: FloatArray
+) -> FloatArray | None:
+    """The vertical in the horizontal axes of the chassis (T, 2): how it leans as it accelerates, and where it stands."""
+    leaning = _leaning(numbers, rate, twist, felt)
+    if leaning is None:
+        return None
+    heading = np.stack([np.cos(steer_angle), np.sin(steer_angle)], axis=2)
+    aside = np.stack([-heading[:, :, 1], heading[:, :, 0]], axis=2)
+    offset_x, offset_y = numbers.caster_offset.T[:, :, None]
+    contact = (numbers.steer_axis + offset_x * heading + offset_y * aside).mean(axis=1)
+    height, aside_of_it = numbers.height_of_mass, mass_centre(numbers, steer_angle) - contact
+    tilt: FloatArray = leaning / height - numbers.lean * GRAVITY / height**2 * aside_of_it
+    return tilt
+
+
 @dataclasses.dataclass(frozen=True)
 class RollingState:
     """How the wheels of a robot roll along a motion, before their slip.
 
     Attributes:
         steer_angle, radius: true headings [rad] and rolling radii [m] (T, n).
+        offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m].
         velocity: joint rates that wheels of the described radius would have (T, n, 2).
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
         grip, speed: load times friction factor [N] and rolling speed [m/s] (T, n).
@@ -495,6 +550,7 @@ class RollingState:
 
     steer_angle: FloatArray
     radius: FloatArray
+    offset: FloatArray
     velocity: FloatArray
     twist: FloatArray
     twist_dot: FloatArray
@@ -510,19 +566,25 @@ def rolling_state(
 ) -> RollingState:
     """Return how the wheels roll along a motion, and the forces under them."""
     steer_angle = np.ascontiguousarray(motion.position[:, :, STEER]) + numbers.steer_zero
-    geometry = numbers.steer_axis, numbers.caster_offset
+    if numbers.heading_lead:
+        steer_angle += numbers.heading_lead * motion.velocity[:, :, STEER]
     velocity, radius = motion.velocity, np.broadcast_to(numbers.radius, steer_angle.shape)
     if around.radius is not None:
         radius = radius + around.radius
         velocity = velocity.copy()
         velocity[:, :, DRIVE] *= radius / numbers.radius
     radius = np.ascontiguousarray(radius)
-    twist, contradiction = twists(numbers, steer_angle, velocity)
+    # On a slope, forces and loads are those of a robot that is accelerated uphill.
+    pull = np.zeros(2) if around.pull is None else around.pull
+    offset = _offsets(numbers, steer_angle)
+    twist, contradiction = twists(numbers, steer_angle, velocity, offset)
     twist_dot = derivative(twist, motion.rate)
-    felt = twist_dot  # on a slope, forces and loads are those of a robot that is accelerated uphill
-    if around.pull is not None:
-        felt = twist_dot.copy()
-        felt[:, :2] -= around.pull
+    tilt = _tilt(numbers, motion.rate, steer_angle, twist, _without(twist_dot, pull))
+    if tilt is not None:
+        offset = _offsets(numbers, steer_angle, tilt)
+        twist, contradiction = twists(numbers, steer_angle, velocity, offset)
+        twist_dot = derivative(twist, motion.rate)
+    felt = _without(twist_dot, pull)
     normal = normal_forces(numbers, steer_angle, acceleration_of(twist, felt), around.height)
     grip = np.maximum(normal if around.grip is None else normal * around.grip, 1.0)
     speed = np.abs(velocity[:, :, DRIVE] * numbers.radius)
@@ -534,11 +596,20 @@ def rolling_state(
         if around.torque is not None:
             torque = torque + around.torque
         force = _contact_forces(
-            numbers.modules, *geometry, radius, steer_angle, velocity, motion.acceleration, torque, spin, twist, felt
-        )
+            numbers.modules, numbers.steer_axis, offset, radius, steer_angle, velocity, motion.acceleration, torque, spin,
+            twist, felt, normal, np.zeros((len(twist), 2)) if tilt is None else tilt,
+        )  # fmt: skip
     else:
-        force = _shared_forces(*geometry, steer_angle, inertial_wrench(numbers, motion, steer_angle, twist, felt))
-    return RollingState(steer_angle, radius, velocity, twist, twist_dot, contradiction, grip, speed, spin, force)
+        wrench = inertial_wrench(numbers, motion, steer_angle, twist, felt)
+        force = _shared_forces(numbers.steer_axis, numbers.caster_offset, steer_angle, wrench)
+    return RollingState(steer_angle, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force)
+
+
+def _without(twist_dot: FloatArray, pull: FloatArray) -> FloatArray:
+    """A twist's derivative (T, 3) without the pull of gravity along the floor."""
+    felt = twist_dot.copy()
+    felt[:, :2] -= pull
+    return felt
 
 
 def channel_sides(
@@ -554,14 +625,14 @@ def channel_sides(
     """
     state = rolling_state(motion, numbers, layout, around)
     slip = slips(numbers, motion.rate, state.speed, state.force, state.grip, around.straight)
-    slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, slip)
+    slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, slip, state.offset)
     twist = state.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)
     leaning = _leaning(numbers, motion.rate, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
         measured.append(
-            _wrench_of(numbers.steer_axis, numbers.caster_offset, state.steer_angle, state.force, state.spin)
+            _wrench_of(numbers.steer_axis, state.offset, state.steer_angle, state.force, state.spin)
         )
         wrench = inertial_wrench(numbers, motion, state.steer_angle, twist, twist_dot)
         if leaning is not None:

@@ -45,12 +45,12 @@ class TorqueResponse:
         self.layout = layout
         count, n = state.force.shape[:2]
         steer_angle = state.steer_angle
-        # Forces in the wheel frames per joint torque (n, 2, 2).
-        of_torque = np.zeros((n, 2, 2))
-        offset_x, offset_y = numbers.caster_offset[:, 0], numbers.caster_offset[:, 1]
-        of_torque[:, 0, DRIVE] = 1.0 / numbers.radius
-        of_torque[:, 1, DRIVE] = offset_y / offset_x / numbers.radius
-        of_torque[:, 1, STEER] = -1.0 / offset_x
+        # Forces in the wheel frames per joint torque (T, n, 2, 2).
+        of_torque = np.zeros((count, n, 2, 2))
+        offset_x, offset_y = state.offset[:, :, 0], state.offset[:, :, 1]
+        of_torque[:, :, 0, DRIVE] = 1.0 / numbers.radius
+        of_torque[:, :, 1, DRIVE] = offset_y / offset_x / numbers.radius
+        of_torque[:, :, 1, STEER] = -1.0 / offset_x
         slopes = numbers.softness[:, :, None] * straight.of_force
         self._ratio_of_torque = slopes @ of_torque
         self._derivative = _derivative_matrix(count, motion.rate)
@@ -59,10 +59,9 @@ class TorqueResponse:
         self._slip_of_ratio = [
             (sparse.diags_array(state.speed[:, i]) @ damped + numbers.tyres[i, LENGTH] * relaxing).tocsr() for i in range(n)
         ]
-        geometry = numbers.steer_axis, numbers.caster_offset, steer_angle
-        jacobian, self._rigid = _rigid_maps(*geometry)
+        jacobian, self._rigid = _rigid_maps(numbers.steer_axis, state.offset, steer_angle)
         wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
-        self._wrench_of_torque = np.einsum("tcnf,nfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
+        self._wrench_of_torque = np.einsum("tcnf,tnfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
         self._inertia, self._turning = _inertia_slopes(numbers, motion, state)
         self._imu_position, self._gyro_scale, self._twist = numbers.imu_position, numbers.gyro_scale, state.twist
 
@@ -118,17 +117,17 @@ def _derivative_matrix(count: int, rate: float) -> sparse.csr_array:
 
 
 @compiled
-def _rigid_maps(steer_axis, caster_offset, steer_angle):  # type: ignore[no-untyped-def]
+def _rigid_maps(steer_axis, offset, steer_angle):  # type: ignore[no-untyped-def]
     """Jacobian A (T, 2n, 3), and the map of slips to twist A^+ and contradiction 1 - A A^+, (T, 2n + 3, 2n)."""
     count, n = steer_angle.shape
     jacobians = np.empty((count, 2 * n, 3))
     maps = np.empty((count, 2 * n + 3, 2 * n))
     unit = np.zeros((n, 2))
     for t in range(count):
-        jacobians[t] = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle[t])
+        jacobians[t] = wheel_jacobian_kernel(steer_axis, offset[t], steer_angle[t])
         for k in range(2 * n):
             unit[k // 2, k % 2] = 1.0
-            twist, contradiction, _ = rigid_motion_kernel(steer_axis, caster_offset, steer_angle[t], unit)
+            twist, contradiction, _ = rigid_motion_kernel(steer_axis, offset[t], steer_angle[t], unit)
             unit[k // 2, k % 2] = 0.0
             maps[t, :3, k] = twist
             for i in range(n):
