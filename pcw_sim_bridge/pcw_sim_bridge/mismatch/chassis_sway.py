@@ -12,6 +12,7 @@ resonator at `frequency`, with `damping`, makes of a.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -76,8 +77,15 @@ class ChassisSway:
 def _resonated(values: FloatArray, rate: float, frequency: float, damping: float) -> FloatArray:
     if len(values) == 0 or frequency > HIGHEST_PART * math.pi * rate:
         return values
+    above, below, start = _resonator(rate, frequency, damping)
+    found: FloatArray = signal.lfilter(above, below, values, zi=start * values[0])[0]
+    return found
+
+
+@functools.lru_cache(maxsize=64)
+def _resonator(rate: float, frequency: float, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Filter coefficients, and the state of the filter that has always seen a one."""
     # Bilinear, such that the resonance stays where it is.
     warped = frequency / math.tan(frequency / (2.0 * rate))
     above, below = signal.bilinear([frequency**2], [1.0, 2.0 * damping * frequency, frequency**2], 0.5 * warped)
-    found: FloatArray = signal.lfilter(above, below, values, zi=signal.lfilter_zi(above, below) * values[0])[0]
-    return found
+    return above, below, signal.lfilter_zi(above, below)

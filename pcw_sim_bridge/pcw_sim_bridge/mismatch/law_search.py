@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from .regression_problem import FloatArray, RegressionProblem
 from .unknown_law import Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
+_Base = tuple[str, Factor]
 # Nats on top of the threshold of the names: there are more hypotheses, and they come from no list of known physics.
 LAW_MARGIN = 15.0
 # Logarithm of their number: what the best of them gains for having been chosen.
@@ -272,6 +273,50 @@ def _held_out_error(regression: WhitenedRegression, instances: Sequence[Instance
     return error
 
 
+class _Screened:
+    """Products of the columns of laws, each a column of a site times functions of time, beside one set of effects.
+
+    The sum over channels is the same for all functions, and is made once for every site and pair of sites.
+    """
+
+    def __init__(
+        self,
+        bases: Mapping[_Base, FloatArray],
+        weight: FloatArray,
+        known: FloatArray,
+        target: FloatArray,
+        total: float,
+        rows: float,
+    ) -> None:
+        """Take columns (S, C) and weights (S, C), what is known (S C, k), what it leaves (S C,), its square, and how many rows
+        count.
+        """
+        self.total, self.rows = total, rows
+        self._bases = {key: base * weight for key, base in bases.items()}
+        self._known, self._target = known.reshape(*weight.shape, -1), target.reshape(weight.shape)
+        self._own: dict[_Base, tuple[FloatArray, FloatArray]] = {}
+        self._pairs: dict[tuple[_Base, _Base], FloatArray] = {}
+
+    def products(
+        self, keys: Sequence[_Base], functions: Sequence[FloatArray]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Gram matrix (F, F) of columns that are sums over sites with functions (S, F); products with known (k, F), target."""
+        width = functions[0].shape[1]
+        plain, cross, moment = np.zeros((width, width)), np.zeros((self._known.shape[2], width)), np.zeros(width)
+        for key, own in zip(keys, functions, strict=True):
+            if key not in self._own:
+                base = self._bases[key]
+                self._own[key] = np.einsum("sc,sck->sk", base, self._known), np.sum(base * self._target, axis=1)
+            known, target = self._own[key]
+            cross += known.T @ own
+            moment += target @ own
+            for other, others in zip(keys, functions, strict=True):
+                if (key, other) not in self._pairs:
+                    self._pairs[key, other] = np.sum(self._bases[key] * self._bases[other], axis=1)
+                plain += own.T @ (self._pairs[key, other][:, None] * others)
+        return plain, cross, moment
+
+
 class _Screen:
     """Scores of many laws at once, by weighted least squares of the channels that they can move."""
 
@@ -289,23 +334,21 @@ class _Screen:
 
         Without regard to the colour of the noise, and on every few samples only.
         """
-        beside = [self._beside(instances) for instances in sets]
-        gains = np.empty((len(sets), len(self.laws)))
         bases = {key: np.ascontiguousarray(base[:: self.step, self._moved]) for key, base in self._bases.items()}
-        for index, law in enumerate(self.laws):
-            columns: FloatArray = sum(  # type: ignore[assignment]
-                p.weight * bases[p.site, p.factor][:, :, None] * self._of(law, p)[:, None, :] for p in law.places
-            )
-            for row, (weight, known, target, total, rows) in enumerate(beside):
-                flat = (columns * weight[:, :, None]).reshape(-1, columns.shape[2])
-                cross = known.T @ flat
-                plain = flat.T @ flat
-                gram = plain - cross.T @ cross
-                # A function that is nowhere at work, or that the tolerances make, must not be blown up.
-                gram[np.diag_indices_from(gram)] += 1e-6 * np.diag(plain) + 1e-12 * np.trace(plain) + 1e-300
-                moment = flat.T @ target
-                explained = min(float(moment @ np.linalg.solve(gram, moment)), 0.999999 * total)
-                gains[row, index] = -0.5 * rows * np.log1p(-explained / total) - 0.5 * flat.shape[1] * np.log(rows)
+        return np.array([self._gains_beside(_Screened(bases, *self._beside(instances))) for instances in sets])
+
+    def _gains_beside(self, screened: _Screened) -> list[float]:
+        gains = []
+        for law in self.laws:
+            functions = [place.weight * self._of(law, place) for place in law.places]
+            keys = [(place.site, place.factor) for place in law.places]
+            plain, cross, moment = screened.products(keys, functions)
+            gram = plain - cross.T @ cross
+            # A function that is nowhere at work, or that the tolerances make, must not be blown up.
+            gram[np.diag_indices_from(gram)] += 1e-6 * np.diag(plain) + 1e-12 * np.trace(plain) + 1e-300
+            explained = min(float(moment @ np.linalg.solve(gram, moment)), 0.999999 * screened.total)
+            gain = -0.5 * screened.rows * np.log1p(-explained / screened.total)
+            gains.append(float(gain - 0.5 * len(moment) * np.log(screened.rows)))
         return gains
 
     def _beside(self, instances: tuple[Instance, ...]) -> tuple[FloatArray, FloatArray, FloatArray, float, float]:

@@ -19,7 +19,7 @@ SMALLEST_CUTOFF = 3.0
 # Effects are evaluated on signals filtered this much wider than the channels, so that they see sharp reversals.
 PREFILTER_RATIO = 2.5
 # Rate of the motions that the model is evaluated on, per cut-off of the wide filter: derivatives stay exact to a percent.
-MOTION_OVERSAMPLING = 5.0
+MOTION_OVERSAMPLING = 4.0
 # The channels end at this part of the resonance of the robot on its tyres.
 TYRE_MARGIN = 0.5
 ALLOWED_DERIVATIVE_NOISE = 0.05

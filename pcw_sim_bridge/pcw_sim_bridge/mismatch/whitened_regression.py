@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg
 
+from .column_bank import ColumnBank
 from .noise_model import NoiseModel
 from .regression_problem import FloatArray, IntArray, RegressionProblem, Shape
 
@@ -75,7 +76,7 @@ class _ScanGroup:
 
     Attributes:
         keys: term and shape of each; term: the former alone (K,).
-        columns: places in the bank (K, P).
+        columns: places in the bank (K, P); gram: their products with one another (K, P, P).
         deviations, lower, upper: of the parameters (K, P).
         log_prior: of the terms (K,).
     """
@@ -83,66 +84,11 @@ class _ScanGroup:
     keys: tuple[tuple[int, Frozen], ...]
     term: IntArray
     columns: IntArray
+    gram: FloatArray
     deviations: FloatArray
     lower: FloatArray
     upper: FloatArray
     log_prior: FloatArray
-
-
-class _ColumnBank:
-    """Whitened columns side by side, and their Gram matrices over all rows and by block; there is room for more to come."""
-
-    def __init__(self, blocks: Sequence[slice], rows: int) -> None:
-        self._blocks = blocks
-        self._count = 0
-        self._data: FloatArray = np.empty((rows, 0))
-        self._by_block: FloatArray = np.empty((len(blocks), 0, 0))
-        self._total: FloatArray = np.empty((0, 0))
-
-    @property
-    def by_block(self) -> FloatArray:
-        """Gram matrices of the blocks (blocks, K, K)."""
-        return self._by_block[:, : self._count, : self._count]
-
-    @property
-    def total(self) -> FloatArray:
-        """Gram matrix of all rows (K, K)."""
-        return self._total[: self._count, : self._count]
-
-    def add(self, columns: FloatArray) -> slice:
-        """Add columns (R, m); return their places."""
-        before, count = self._count, self._count + columns.shape[1]
-        if count > self._data.shape[1]:
-            self._make_room(max(count, 2 * before))
-        self._count = count
-        self._data[:, before:count] = columns
-        for k, piece in enumerate(self._blocks):
-            self._by_block[k, :count, before:count] = self._data[piece, :count].T @ columns[piece]
-        new = self._by_block[:, :before, before:count]
-        self._by_block[:, before:count, :before] = new.transpose(0, 2, 1)
-        self._total[:count, before:count] = self._by_block[:, :count, before:count].sum(axis=0)
-        self._total[before:count, :before] = self._total[:before, before:count].T
-        return slice(before, count)
-
-    def _make_room(self, size: int) -> None:
-        count = self._count
-        data = np.empty((self._data.shape[0], size))
-        by_block, total = np.empty((len(self._blocks), size, size)), np.empty((size, size))
-        data[:, :count] = self._data[:, :count]
-        by_block[:, :count, :count], total[:count, :count] = self.by_block, self.total
-        self._data, self._by_block, self._total = data, by_block, total
-
-    def rescale(self, factors: FloatArray) -> None:
-        """Multiply the rows of every block by a factor (blocks,)."""
-        for piece, factor in zip(self._blocks, factors, strict=True):
-            self._data[piece, : self._count] *= factor
-        self.by_block[...] *= factors[:, None, None] ** 2
-        self.total[...] = self.by_block.sum(axis=0)
-
-    def columns(self, places: IntArray) -> FloatArray:
-        """Return columns (R, m) by their places."""
-        found: FloatArray = self._data[:, places]
-        return found
 
 
 def _marginal_gains(
@@ -180,8 +126,7 @@ def _marginal_gains(
 class WhitenedRegression:
     """One problem under one noise model and one set of robust weights.
 
-    Whitened columns stand in one bank with their block-wise Gram matrix, which grows as columns are asked for; fits and
-    scans only pick from it.
+    Whitened columns stand in one bank, to which those are added that are asked for; fits and scans only pick from it.
     """
 
     def __init__(
@@ -212,7 +157,7 @@ class WhitenedRegression:
         edges = np.flatnonzero(np.diff(sample_block)) + 1
         bounds = [0, *edges.tolist(), self.rows]
         self.blocks = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-        self._bank = _ColumnBank(self.blocks, self.rows)
+        self._bank = ColumnBank(self.blocks, self.rows)
         self._base = self._bank.add(np.concatenate([self.nuisance, self.target[:, None]], axis=1))
         self._places: dict[tuple[int, Frozen], slice] = {}
         self._long_scans: dict[int, tuple[npt.NDArray[np.float32], FloatArray]] = {}
@@ -238,6 +183,7 @@ class WhitenedRegression:
             self.nuisance[piece] *= factor
         self._bank.rescale(factors)
         self._long_scans.clear()
+        self._short_scans = None
 
     def block_labels(self) -> list[int]:
         """Labels of the blocks that hold usable rows, in the order of `blocks`."""
@@ -287,13 +233,13 @@ class WhitenedRegression:
     def grams(self, instances: Sequence[Instance]) -> FloatArray:
         """Block-wise Gram matrices of [nuisances, instances..., target], (blocks, k + 1, k + 1)."""
         picked = self._picked(instances)
-        return self._bank.by_block[:, picked[:, None], picked]
+        return self._bank.by_block(picked)
 
     def fit(self, instances: Sequence[Instance]) -> Fit:
         """Joint fit of nuisances and instances."""
         picked = self._picked(instances)
         deviations = self.deviations(instances)
-        mean, inverse, log_determinant, rss = _solve(self._bank.total[picked[:, None], picked], deviations)
+        mean, inverse, log_determinant, rss = _solve(self._bank.gram(picked), deviations)
         occam = sum(instance.occam for instance in instances)
         prior = sum(self.problem.terms[instance.term].log_prior for instance in instances)
         log_evidence = -0.5 * log_determinant - 0.5 * rss - occam + prior
@@ -358,20 +304,22 @@ class WhitenedRegression:
             groups: dict[int, list[tuple[int, Frozen]]] = {}
             for key in wanted:
                 groups.setdefault(len(problem.terms[key[0]].base_indices()), []).append(key)
-            self._short_scans = [
-                _ScanGroup(
+            self._short_scans = []
+            for keys in groups.values():
+                places = np.array(
+                    [[self._places[key].start + i for i in problem.terms[key[0]].base_indices()] for key in keys],
+                    dtype=np.int64,
+                )
+                self._short_scans.append(_ScanGroup(
                     keys=tuple(keys),
                     term=np.array([index for index, _ in keys]),
-                    columns=np.array([
-                        [self._places[key].start + i for i in problem.terms[key[0]].base_indices()] for key in keys
-                    ]),
+                    columns=places,
+                    gram=self._bank.own_grams(places),
                     deviations=self._per_key(keys, "deviation"),
                     lower=self._per_key(keys, "lower"),
                     upper=self._per_key(keys, "upper"),
                     log_prior=np.array([problem.terms[index].log_prior for index, _ in keys]),
-                )
-                for keys in groups.values()
-            ]
+                ))  # fmt: skip
         return self._short_scans
 
     def _per_key(self, keys: Sequence[tuple[int, Frozen]], name: str) -> FloatArray:
@@ -396,12 +344,12 @@ class WhitenedRegression:
             -inf where a sign is not allowed.
         """
         short = self._short_scan()
-        picked = self._picked(instances)[:-1]
+        with_target = self._picked(instances)
+        picked = with_target[:-1]
         bank, deviations = self._bank, self.deviations(instances)
-        precision = bank.total[picked[:, None], picked] + np.diag(1.0 / deviations**2)
-        factor = np.linalg.cholesky(precision)
-        last = self._base.stop - 1
-        own = bank.total[picked, last][:, None] if targets is None else bank.columns(picked).T @ targets
+        gram = bank.gram(with_target)
+        factor = np.linalg.cholesky(gram[:-1, :-1] + np.diag(1.0 / deviations**2))
+        own = gram[:-1, -1:] if targets is None else bank.columns(picked).T @ targets
         projected = linalg.solve_triangular(factor, own, lower=True)
         used = {instance.term for instance in instances}
 
@@ -415,10 +363,11 @@ class WhitenedRegression:
                 continue
             columns = group.columns[keep]
             flat = columns.ravel()
-            cross = linalg.solve_triangular(factor, bank.total[picked[:, None], flat], lower=True)
-            moment = bank.total[flat, last][:, None] if targets is None else bank.columns(flat).T @ targets
+            products = bank.products(with_target, flat)
+            cross = linalg.solve_triangular(factor, products[:-1], lower=True)
+            moment = products[-1:].T if targets is None else bank.columns(flat).T @ targets
             gains = _marginal_gains(
-                bank.total[columns[:, :, None], columns[:, None, :]], cross, moment, projected,
+                group.gram[keep], cross, moment, projected,
                 group.deviations[keep], group.lower[keep], group.upper[keep],
             ) + group.log_prior[keep][:, None]  # fmt: skip
             keys = [key for key, kept in zip(group.keys, keep, strict=True) if kept]
