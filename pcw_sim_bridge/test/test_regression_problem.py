@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, SelectionSettings
-from pcw_sim_bridge.mismatch.noise_model import NoiseModel
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.regression_problem import (
     Channel,
     LinearParameter,
@@ -18,6 +18,7 @@ from pcw_sim_bridge.mismatch.regression_problem import (
     SizedTerm,
     Term,
 )
+from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
 SAMPLES, RATE = 600, 50.0
@@ -86,7 +87,7 @@ def test_an_effect_out_of_proportion_comes_out_with_its_size():
     assert fit.mean[0] == pytest.approx(0.04, abs=0.003)
     assert fit.mean[1] == pytest.approx(2.0, rel=0.01)
     assert search.problem.powers == {(0, (), 0): pytest.approx(2.0, abs=0.01)}
-    assert search.channel_deviations(search.residual_of(instances)) == pytest.approx([NOISE], rel=0.1)
+    assert channel_deviations(search.residual_of(instances), search.problem.valid) == pytest.approx([NOISE], rel=0.1)
 
 
 def test_a_secant_is_exact_with_the_effect_and_without_it():

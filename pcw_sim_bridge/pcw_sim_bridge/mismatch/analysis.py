@@ -14,7 +14,7 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 
 from .command_findings import command_findings
-from .evidence_selection import LadderStep, SelectionSettings
+from .evidence_selection import LadderStep
 from .explanation import Explanation, NamedTerm, explain, explanation_by
 from .findings import (
     ChannelFinding,
@@ -33,6 +33,7 @@ from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
 from .regression_problem import FloatArray, RegressionProblem
+from .selection_settings import SelectionSettings
 from .subject import Subject
 from .whitened_regression import Fit, predicted
 

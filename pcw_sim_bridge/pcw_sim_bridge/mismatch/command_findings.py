@@ -9,13 +9,14 @@ import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
 
-from .evidence_selection import EffectSearch, SelectionSettings
+from .evidence_selection import EffectSearch
 from .explanation import Explanation, NamedTerm, explain
 from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
 from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
 from .regression_problem import FloatArray, RegressionProblem
+from .selection_settings import SelectionSettings
 
 Progress = Callable[[str], None]
 

@@ -17,9 +17,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .noise_model import SLOW_ORDINATES, fit_noise_model, huber_weights, robust_deviation, white_noise_model
+from .effect_gates import EffectGates
+from .noise_model import (
+    SLOW_ORDINATES,
+    channel_deviations,
+    fit_noise_model,
+    huber_weights,
+    robust_deviation,
+    white_noise_model,
+)
 from .regression_problem import (
-    BoolArray,
     FloatArray,
     IntArray,
     RegressionProblem,
@@ -27,7 +34,8 @@ from .regression_problem import (
     contiguous_blocks,
     segment_slices,
 )
-from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression, predicted
+from .selection_settings import SelectionSettings
+from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression
 
 Progress = Callable[[str], None]
 # So many times the problem is made exact where its fit came out, or this part of the way there.
@@ -36,42 +44,12 @@ STEPS = (1.0, 0.5, 0.2)
 GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
 SPLIT_AMONG = 12  # candidates that a term may have taken in
 DERIVED_FROM = 2  # after so many rounds that did not settle, columns are taken anew; after twice as many the next time
-# What happens once must explain so many times what is left anywhere: models err in bursts, and some shape fits one of them.
-ABOVE_BURSTS = 3.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
 STEADY = 0.2
 # So many times the noise is estimated again, until no channel's falls by more than this.
 SETTLING_ROUNDS, SETTLED = 8, 0.9
-
-
-@dataclasses.dataclass(frozen=True)
-class SelectionSettings:
-    """What the user may turn.
-
-    Attributes:
-        false_alarm_rate: share of recordings with nothing missing in which something may be named.
-        lenient_gain: nats to enter the first, over-complete model.
-        smallest_threshold: nats below which nothing is named however quiet the surrogates are (odds of 8000 to 1): evidence
-            takes the model for exact, and many small errors of it look like small effects.
-        smallest_share: a term must move some channel by at least this part of the rms that remains there. Below it lie
-            the details that no model of a real machine gets right, and they repeat as faithfully as an effect does.
-        smallest_part: a term must also move some channel by this part of what all effects together do: the shape of a
-            large effect is itself only known so well, and its error must not be named a further effect.
-        blocks: of the cross-validation.
-        first_repeats: instances of a repeatable term in the first over-complete set; more would eat red noise line by line.
-    """
-
-    false_alarm_rate: float = 0.005
-    lenient_gain: float = 2.0
-    smallest_threshold: float = 9.0
-    smallest_share: float = 0.25
-    smallest_part: float = 0.02
-    blocks: int = 10
-    surrogates: int = 200
-    largest_set: int = 16
-    first_repeats: int = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,15 +211,10 @@ class EffectSearch:
     def _error(self, residual: FloatArray, noise: FloatArray) -> float:
         """Sum of squares of a residual (T, C) in units of the deviations of another, outliers held down."""
         valid, total = self.problem.valid, 0.0
-        for channel, deviation in enumerate(self.channel_deviations(noise)):
+        for channel, deviation in enumerate(channel_deviations(noise, valid)):
             values = residual[valid[:, channel], channel] / deviation
             total += float(np.sum(huber_weights(values) * values**2))
         return total
-
-    def channel_deviations(self, residual: FloatArray) -> FloatArray:
-        """Standard deviation of every channel of a residual (T, C), outliers held down, (C,)."""
-        valid = self.problem.valid
-        return np.array([robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])])
 
     def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
         """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
@@ -297,7 +270,8 @@ class EffectSearch:
                 break
             instances = (*instances, self.refine_shape(regression, instances, step.instance))
             instances = self.improve(regression, instances)
-            regression.rescale(self.channel_deviations(regression.unwhitened_residual(regression.fit(instances))))
+            left = regression.unwhitened_residual(regression.fit(instances))
+            regression.rescale(channel_deviations(left, self.problem.valid))
         return instances
 
     def _settle(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> None:
@@ -308,7 +282,7 @@ class EffectSearch:
         deviations = regression.noise.taps[:, 0] ** -1.0
         for _ in range(SETTLING_ROUNDS):
             before = deviations
-            deviations = self.channel_deviations(regression.unwhitened_residual(regression.fit(instances)))
+            deviations = channel_deviations(regression.unwhitened_residual(regression.fit(instances)), self.problem.valid)
             regression.rescale(deviations)
             if np.all(deviations > SETTLED * before):
                 break
@@ -528,7 +502,7 @@ class EffectSearch:
         rejected: set[int] = set()  # of these what no other term can have made superfluous
         while True:
             fit = regression.fit(instances)
-            losses, held_out, shares = self.judge(regression, instances, fit)
+            losses, held_out, shares = EffectGates(self.problem, self.settings).judge(regression, instances, fit)
             reasons = [
                 "below the threshold"
                 if loss < threshold
@@ -545,7 +519,7 @@ class EffectSearch:
             ]
             failing = [index for index, reason in enumerate(reasons) if reason]
             if not failing:
-                needed = self.needed_together(regression, instances, fit)
+                needed = EffectGates(self.problem, self.settings).needed_together(regression, instances, fit)
                 if len(needed) == len(instances):
                     break
                 for instance, loss in zip(instances, losses, strict=True):
@@ -580,121 +554,17 @@ class EffectSearch:
         self.progress(f"- {label}: {loss:.1f} nats, {reason}")
         self.ladder.append(LadderStep(f"drop {label}", loss, held_out, reason))
 
-    def needed_together(
-        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
-    ) -> tuple[Instance, ...]:
-        """The fewest of the terms, taken as each does most, beside which all others together do too little to count.
-
-        A payload and stronger motors undo each other: without either the other is far off, without both little is.
-        """
-        order: list[Instance] = []
-        while len(order) < len(instances) - 1:
-            rest = [instance for instance in instances if instance not in order]
-            order.append(max(rest, key=lambda instance: regression.fit([*order, instance]).log_evidence))
-        residual = regression.unwhitened_residual(fit)
-        remains = self.channel_deviations(residual)
-        explained, cost = predicted(self.problem, fit), regression.tolerance_cost(fit)
-        for count in range(len(instances) - 1):
-            left_out = [instance for instance in instances if instance not in order[:count]]
-            without = regression.fit(order[:count])
-            least = max(self._least(instance) for instance in left_out)
-            change = self._sizes(explained - predicted(self.problem, without))
-            share = float(np.max(change / np.maximum(np.maximum(least * remains, self._details(left_out)), 1e-300)))
-            retuning = regression.tolerance_cost(without) - cost
-            if max(share, retuning / (len(left_out) * self.settings.smallest_threshold)) < 1.0:
-                return tuple(instance for instance in instances if instance in order[:count])
-        return instances
-
-    def _least(self, instance: Instance) -> float:
-        """Part of what remains in some channel that a term must do at least.
-
-        Columns with the residual's own noise explain a part of that noise; an effect is more than all of it.
-        """
-        return 1.0 if self.problem.terms[instance.term].noisy else self.settings.smallest_share
-
-    def _details(self, instances: Sequence[Instance]) -> FloatArray:
-        """What the model itself misjudges (C,), which is no effect: three deviations of its scale, and its slips.
-
-        What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that thrice.
-        """
-        scale = 3.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
-        if self.problem.misjudged is None:
-            return scale
-        noisy = any(self.problem.terms[instance.term].noisy for instance in instances)
-        return np.maximum(scale, (3.0 if noisy else 1.0) * self._sizes(self.problem.misjudged))
-
     def conclude(self, instances: Sequence[Instance], threshold: float) -> Selection:
         """Settle on a set: noise, fit and figures as they are with just these effects."""
         chosen = tuple(instances)
         regression = self.whiten_at(self.residual_of(chosen))
         fit = regression.fit(chosen)
-        losses, held_out, _ = self.judge(regression, chosen, fit)
+        losses, held_out, _ = EffectGates(self.problem, self.settings).judge(regression, chosen, fit)
         named = [
             LadderStep(self.label(instance), losses[index], held_out[index], "named")
             for index, instance in enumerate(chosen)
         ]
         return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), (*self.ladder, *named))
-
-    def judge(
-        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
-    ) -> tuple[list[float], list[float], list[float]]:
-        """Per instance: evidence lost without it, held-out gain [nats], contribution against the smallest that counts."""
-        if not instances:
-            return [], [], []
-        residual = regression.unwhitened_residual(fit)
-        # In full: weights that hold down outliers would hold down the very bursts that an event is measured against.
-        information = np.array([channel.information for channel in self.problem.channels])
-        unexplained = regression.noise.whiten(residual, self.problem.valid, self.problem.segment) ** 2 @ information
-        remains = self.channel_deviations(residual)
-        full_scores = regression.block_scores(instances)
-        losses, held_out = [], []
-        own: list[FloatArray] = []
-        net: list[FloatArray] = []
-        retunings, bursts = [], []
-        explained = predicted(self.problem, fit)
-        position = len(self.problem.nuisances)
-        for index, instance in enumerate(instances):
-            others = instances[:index] + instances[index + 1 :]
-            without = regression.fit(others)
-            losses.append(fit.log_evidence - without.log_evidence)
-            # Held-out error alone would not mind a mass far outside its tolerance; the description would.
-            retuning = regression.tolerance_cost(without) - regression.tolerance_cost(fit)
-            once = self.problem.terms[instance.term].once
-            support = losses[-1] if once else 0.5 * float(np.sum(regression.block_scores(others) - full_scores))
-            held_out.append(support + retuning)
-            columns = self.problem.columns(instance.term, instance.shape)[..., list(instance.active)]
-            part = columns @ fit.mean[position : position + len(instance.active)]
-            position += len(instance.active)
-            own.append(self._sizes(part))
-            # What a term does for the prediction is what the others cannot do in its place.
-            change = explained - predicted(self.problem, without)
-            net.append(self._sizes(change, _at_work(part) if once else None))
-            bursts.append(0.5 * self._largest_burst(unexplained, _at_work(part)) if once else 0.0)
-            retunings.append(retuning)
-        total = np.sqrt(np.sum(np.square(own), axis=0))
-        shares = []
-        for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
-            floor = np.maximum(self._least(instance) * remains, self.settings.smallest_part * total)
-            floor = np.maximum(floor, self._details([instance]))
-            share = float(np.max(sizes / np.maximum(floor, 1e-300)))
-            # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
-            share = max(share, retunings[index] / self.settings.smallest_threshold)
-            shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
-        return losses, held_out, shares
-
-    def _largest_burst(self, unexplained: FloatArray, at_work: BoolArray) -> float:
-        """Most that is left unexplained (T,), beyond what noise leaves, anywhere in a time as long as one at work (T,)."""
-        excess = unexplained - self.problem.valid.sum(axis=1) * float(np.sum(unexplained) / max(self.problem.valid.sum(), 1))
-        length = int(np.sum(at_work))
-        sums = np.cumsum(np.concatenate([[0.0], np.where(at_work, 0.0, excess)]))
-        return float(np.max(sums[length:] - sums[:-length], initial=0.0))
-
-    def _sizes(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
-        """Root mean square of (T, C) over valid samples, per channel; `among` some samples (T,) only."""
-        valid = self.problem.valid if among is None else self.problem.valid & among[:, None]
-        counts = np.maximum(valid.sum(axis=0), 1)
-        sizes: FloatArray = np.sqrt(np.sum(np.where(valid, values, 0.0) ** 2, axis=0) / counts)
-        return sizes
 
     def label(self, instance: Instance) -> str:
         """Effect, target and shape in one short text."""
@@ -706,13 +576,6 @@ class EffectSearch:
 def _terms(instances: Sequence[Instance]) -> tuple[int, ...]:
     """Which terms are at work, and how often."""
     return tuple(sorted(instance.term for instance in instances))
-
-
-def _at_work(part: FloatArray) -> BoolArray:
-    """Samples (T,) in which a contribution (T, C) is a fair part of its largest in some channel."""
-    largest = np.maximum(np.max(np.abs(part), axis=0), 1e-300)
-    at_work: BoolArray = np.any(np.abs(part) > 0.2 * largest, axis=1)
-    return at_work
 
 
 def _phase_randomised(values: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -26,9 +26,11 @@ from scipy import stats
 
 from pcw_description.effects.registry import get
 
-from .evidence_selection import EffectSearch, Progress, Selection, SelectionSettings
+from .effect_gates import EffectGates
+from .evidence_selection import EffectSearch, Progress, Selection
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
 from .regression_problem import FloatArray, RegressionProblem, Term
+from .selection_settings import SelectionSettings
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
@@ -341,7 +343,7 @@ def _still_needed(
     keeper = instances[refined]
     while True:
         fit = regression.fit(instances)
-        losses, held_out, shares = search.judge(regression, instances, fit)
+        losses, held_out, shares = EffectGates(search.problem, search.settings).judge(regression, instances, fit)
         evidence = {}
         for instance, loss, gain, share in zip(instances, losses, held_out, shares, strict=True):
             if instance != keeper and (loss < threshold or gain <= 0.0 or share < 1.0):

@@ -117,6 +117,11 @@ def _weights_after_gaps(taps: FloatArray) -> FloatArray:
     return weights
 
 
+def channel_deviations(residual: FloatArray, valid: BoolArray) -> FloatArray:
+    """Standard deviation of every channel of a residual (T, C), outliers held down, (C,)."""
+    return np.array([robust_deviation(residual[valid[:, c], c]) for c in range(residual.shape[1])])
+
+
 def huber_weights(standardised: FloatArray) -> FloatArray:
     """Weights min(1, HUBER / |x|) of standardised values."""
     size = np.abs(standardised)

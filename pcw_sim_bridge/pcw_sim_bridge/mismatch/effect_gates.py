@@ -1,0 +1,134 @@
+"""What an effect has to do for a recording to be named: the gates that a set of effects passes one by one, and together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .noise_model import channel_deviations
+from .regression_problem import BoolArray, FloatArray, RegressionProblem
+from .selection_settings import SelectionSettings
+from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
+
+# What happens once must explain so many times what is left anywhere: models err in bursts, and some shape fits one of them.
+ABOVE_BURSTS = 3.0
+
+
+class EffectGates:
+    """The gates of one problem."""
+
+    def __init__(self, problem: RegressionProblem, settings: SelectionSettings) -> None:
+        """Take the problem as it is exact now."""
+        self.problem, self.settings = problem, settings
+
+    def judge(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
+    ) -> tuple[list[float], list[float], list[float]]:
+        """Per instance: evidence lost without it, held-out gain [nats], contribution against the smallest that counts."""
+        if not instances:
+            return [], [], []
+        residual = regression.unwhitened_residual(fit)
+        # In full: weights that hold down outliers would hold down the very bursts that an event is measured against.
+        information = np.array([channel.information for channel in self.problem.channels])
+        unexplained = regression.noise.whiten(residual, self.problem.valid, self.problem.segment) ** 2 @ information
+        remains = channel_deviations(residual, self.problem.valid)
+        full_scores = regression.block_scores(instances)
+        losses, held_out = [], []
+        own: list[FloatArray] = []
+        net: list[FloatArray] = []
+        retunings, bursts = [], []
+        explained = predicted(self.problem, fit)
+        position = len(self.problem.nuisances)
+        for index, instance in enumerate(instances):
+            others = instances[:index] + instances[index + 1 :]
+            without = regression.fit(others)
+            losses.append(fit.log_evidence - without.log_evidence)
+            # Held-out error alone would not mind a mass far outside its tolerance; the description would.
+            retuning = regression.tolerance_cost(without) - regression.tolerance_cost(fit)
+            once = self.problem.terms[instance.term].once
+            support = losses[-1] if once else 0.5 * float(np.sum(regression.block_scores(others) - full_scores))
+            held_out.append(support + retuning)
+            columns = self.problem.columns(instance.term, instance.shape)[..., list(instance.active)]
+            part = columns @ fit.mean[position : position + len(instance.active)]
+            position += len(instance.active)
+            own.append(self._sizes(part))
+            # What a term does for the prediction is what the others cannot do in its place.
+            change = explained - predicted(self.problem, without)
+            net.append(self._sizes(change, _at_work(part) if once else None))
+            bursts.append(0.5 * self._largest_burst(unexplained, _at_work(part)) if once else 0.0)
+            retunings.append(retuning)
+        total = np.sqrt(np.sum(np.square(own), axis=0))
+        shares = []
+        for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
+            floor = np.maximum(self._least(instance) * remains, self.settings.smallest_part * total)
+            floor = np.maximum(floor, self._details([instance]))
+            share = float(np.max(sizes / np.maximum(floor, 1e-300)))
+            # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
+            share = max(share, retunings[index] / self.settings.smallest_threshold)
+            shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
+        return losses, held_out, shares
+
+    def _largest_burst(self, unexplained: FloatArray, at_work: BoolArray) -> float:
+        """Most that is left unexplained (T,), beyond what noise leaves, anywhere in a time as long as one at work (T,)."""
+        excess = unexplained - self.problem.valid.sum(axis=1) * float(np.sum(unexplained) / max(self.problem.valid.sum(), 1))
+        length = int(np.sum(at_work))
+        sums = np.cumsum(np.concatenate([[0.0], np.where(at_work, 0.0, excess)]))
+        return float(np.max(sums[length:] - sums[:-length], initial=0.0))
+
+    def _sizes(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
+        """Root mean square of (T, C) over valid samples, per channel; `among` some samples (T,) only."""
+        valid = self.problem.valid if among is None else self.problem.valid & among[:, None]
+        counts = np.maximum(valid.sum(axis=0), 1)
+        sizes: FloatArray = np.sqrt(np.sum(np.where(valid, values, 0.0) ** 2, axis=0) / counts)
+        return sizes
+
+    def needed_together(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
+    ) -> tuple[Instance, ...]:
+        """The fewest of the terms, taken as each does most, beside which all others together do too little to count.
+
+        A payload and stronger motors undo each other: without either the other is far off, without both little is.
+        """
+        order: list[Instance] = []
+        while len(order) < len(instances) - 1:
+            rest = [instance for instance in instances if instance not in order]
+            order.append(max(rest, key=lambda instance: regression.fit([*order, instance]).log_evidence))
+        residual = regression.unwhitened_residual(fit)
+        remains = channel_deviations(residual, self.problem.valid)
+        explained, cost = predicted(self.problem, fit), regression.tolerance_cost(fit)
+        for count in range(len(instances) - 1):
+            left_out = [instance for instance in instances if instance not in order[:count]]
+            without = regression.fit(order[:count])
+            least = max(self._least(instance) for instance in left_out)
+            change = self._sizes(explained - predicted(self.problem, without))
+            share = float(np.max(change / np.maximum(np.maximum(least * remains, self._details(left_out)), 1e-300)))
+            retuning = regression.tolerance_cost(without) - cost
+            if max(share, retuning / (len(left_out) * self.settings.smallest_threshold)) < 1.0:
+                return tuple(instance for instance in instances if instance in order[:count])
+        return instances
+
+    def _least(self, instance: Instance) -> float:
+        """Part of what remains in some channel that a term must do at least.
+
+        Columns with the residual's own noise explain a part of that noise; an effect is more than all of it.
+        """
+        return 1.0 if self.problem.terms[instance.term].noisy else self.settings.smallest_share
+
+    def _details(self, instances: Sequence[Instance]) -> FloatArray:
+        """What the model itself misjudges (C,), which is no effect: three deviations of its scale, and its slips.
+
+        What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that thrice.
+        """
+        scale = 3.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
+        if self.problem.misjudged is None:
+            return scale
+        noisy = any(self.problem.terms[instance.term].noisy for instance in instances)
+        return np.maximum(scale, (3.0 if noisy else 1.0) * self._sizes(self.problem.misjudged))
+
+
+def _at_work(part: FloatArray) -> BoolArray:
+    """Samples (T,) in which a contribution (T, C) is a fair part of its largest in some channel."""
+    largest = np.maximum(np.max(np.abs(part), axis=0), 1e-300)
+    at_work: BoolArray = np.any(np.abs(part) > 0.2 * largest, axis=1)
+    return at_work
