@@ -60,6 +60,14 @@ def compiled_array_kernel(function: Function) -> Function:
     return _compiled_as(ARRAY_SIGNATURE, function)
 
 
+def awaits_compiling(function: Callable[..., Any]) -> bool:
+    """Whether the first call of what `compiled` returned will compile it, which takes seconds: once after an installation."""
+    if not COMPILES or getattr(function, "signatures", None):
+        return False
+    load_index = getattr(getattr(getattr(function, "_cache", None), "_cache_file", None), "_load_index", None)
+    return load_index is not None and not load_index()
+
+
 def _compiled_as(signature: str, function: Function) -> Function:
     if not NUMBA_AVAILABLE:
         return function

@@ -35,12 +35,16 @@ def test_an_edited_kernel_takes_effect_in_its_callers(tmp_path: Path) -> None:
     }
 
     def run() -> tuple[float, int]:
-        """Return the force and how often the caller's machine code came from the cache."""
-        script = "from kernels_under_test.caller import force; print(force(1.0), sum(force.stats.cache_hits.values()))"
+        """Return the force and how often the caller's machine code came from the cache; it was said before if it would not."""
+        script = (
+            "from pcw_description.compiled import awaits_compiling; from kernels_under_test.caller import force; "
+            "awaits = awaits_compiling(force); print(force(1.0), sum(force.stats.cache_hits.values()), int(awaits))"
+        )
         output = subprocess.run(
             [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=120
         )
-        force, hits = output.stdout.split()
+        force, hits, awaits = output.stdout.split()
+        assert int(awaits) == 1 - int(hits)
         return float(force), int(hits)
 
     (package / "callee.py").write_text(CALLEE.format(value=2.0))

@@ -82,7 +82,8 @@ def analyse(
     progress(f"reading {len(fit) + len(holdout)} recording(s)")
     opened = [subject.open(path, "fit", topics) for path in fit]
     held_out = [subject.open(path, "holdout", topics) for path in holdout]
-    progress("building the channels")
+    once = "; its model is compiled first, once after an installation" if subject.awaits_compiling() else ""
+    progress(f"building the channels{once}")
     problem = subject.problem(opened)
     inputs = tuple(o.finding for o in (*opened, *held_out))
     usable = float(problem.valid.any(axis=1).sum()) / problem.rate

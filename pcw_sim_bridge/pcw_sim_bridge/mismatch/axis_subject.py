@@ -50,6 +50,10 @@ class AxisSubject:
         finding = InputFinding(str(path), file_digest(path), recording.duration, role, recording.warnings)
         return Opened(recording, finding)
 
+    def awaits_compiling(self) -> bool:
+        """Return False: its kernels are compiled as they are imported."""
+        return False
+
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem."""
         builder = AxisProblemBuilder(self.axis, [o.recording for o in opened], self._cutoff)

@@ -31,7 +31,7 @@ from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .robot_channels import SLIP_FRACTION, STILL_SPEED, RobotProblemBuilder
 from .robot_motion import choose_cutoff
 from .robot_rollout import robot_windows, rollout_floor, rollout_squares
-from .rolling_model import ModelNumbers, twists
+from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
 from .subject import Opened
 
@@ -107,6 +107,10 @@ class RobotSubject:
                 raise MismatchError(
                     f"{lacks} has no {name}, and {has} has; allowed: recordings with the same sensors in one analysis"
                 )
+
+    def awaits_compiling(self) -> bool:
+        """Return whether the channels' model was not used on this machine before."""
+        return model_awaits_compiling()
 
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem."""

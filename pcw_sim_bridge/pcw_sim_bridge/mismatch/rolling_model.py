@@ -30,7 +30,7 @@ import dataclasses
 import numpy as np
 
 from pcw_description.augmented_object_model import dynamic_parameters
-from pcw_description.compiled import compiled
+from pcw_description.compiled import awaits_compiling, compiled
 from pcw_description.contact.contact_model import (
     DAMPING_TIME,
     LAMBDA,
@@ -658,3 +658,8 @@ def channel_sides(
         measured.append(motion.tracked_twist + late)
         predicted.append(twist)
     return np.concatenate(measured, axis=1), np.concatenate(predicted, axis=1)
+
+
+def model_awaits_compiling() -> bool:
+    """Whether the model's first use will take seconds longer than any later one on this machine."""
+    return awaits_compiling(_contact_forces)

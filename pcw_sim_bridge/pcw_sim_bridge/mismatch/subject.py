@@ -37,6 +37,9 @@ class Subject(Protocol):
             PcwError: it cannot be read; the message names it and says what is wrong.
         """
 
+    def awaits_compiling(self) -> bool:
+        """Return whether the first problem will take seconds longer than any later one on this machine."""
+
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem of recordings; later calls keep the filters that the first one chose."""
 
