@@ -41,8 +41,8 @@ from pcw_description.contact.contact_model import (
 )
 from pcw_description.differential_kinematics import rigid_motion_kernel, wheel_jacobian_kernel
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
+from pcw_description.support_forces import support_forces
 
-from ..plants.support_forces import support_forces
 from .chassis_sway import ChassisSway
 from .regression_problem import Channel, FloatArray
 from .robot_motion import RobotMotion

@@ -41,6 +41,7 @@ from pcw_description.effects.kinds import (
     RADIUS_SLOPE,
 )
 from pcw_description.robot_description import FloatArray, RobotDescription
+from pcw_description.support_forces import support_forces
 
 from .caster_arrays import (
     BX,
@@ -77,7 +78,6 @@ from .caster_arrays import (
 from .drivetrain import joint_torques, motor_torques, turn_motors
 from .effect_tables import ANGLE, RATE, EffectTables, as_joint_motion
 from .plant import PlantError, PlantState, gravity_in_base
-from .support_forces import support_forces
 from .surroundings import chassis_wrench, ground_under
 from .true_robot import as_it_really_is, without_geared_rotors
 

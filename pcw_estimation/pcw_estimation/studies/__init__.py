@@ -1,0 +1,1 @@
+"""Studies that measure the estimators, and write what they find into the documentation."""
