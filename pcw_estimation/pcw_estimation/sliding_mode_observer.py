@@ -14,8 +14,8 @@ and the velocity follows from the force, drawn to the lower root of mu(lambda) =
     v_x_hat_dot = F_m / M + k w (r rho_dot_hat (1 - lambda_low(F_m / F_z)) - v_x_hat),      0 <= w <= 1.
 
 While w is 1 the mass that explains the acceleration is learned within its tolerance; it serves while w is 0. What cannot be
-known from these signals is a common scale: r, v_x, 1/F, M/r^2 may all be wrong together, and an error of the radius is an error
-of the velocity by the same part.
+known from these signals is a common scale: r, v_x, 1/F, M/r^2 may all be wrong together, and an error of the radius is an
+error of the velocity by the same part.
 
 A wheel that has already broken loose when the observer begins is on the upper root; no velocity is vouched for until it grips.
 """
@@ -52,15 +52,18 @@ MEASURED = ("speed", "angle")
 LEARNING_MEMORY, LEARNING_PRIOR = 2.0, 0.5
 # Beyond twice the tolerance of the mass and this much, forces and accelerations contradict each other (logarithm).
 CONTRADICTION_FLOOR = 0.05
+# Slip acceleration is averaged over this time [s]: noise and a controller's ripple are no slip.
+SLIP_ACCELERATION_MEMORY = 0.01
 # Forces count as found after so many time constants of the joint observers.
 SETTLED_TIME_CONSTANTS = 5.0
 
 # Layout of the numbers of the observer; those of trust come first.
-_BANDWIDTH, _LAYER, _LINEAR_SHARE, _ANGLE_ONLY, _ACCURACY, _ACCURACY_FLOOR = range(TRUST_SIZE, TRUST_SIZE + 6)
+BANDWIDTH, LAYER, LINEAR_SHARE, ANGLE_ONLY, ACCURACY, ACCURACY_FLOOR = range(TRUST_SIZE, TRUST_SIZE + 6)
 _INERTIA, _RADIUS, _MASS, _NORMAL_FORCE = range(4)
 # Layout of the state.
-_COUNT, _TIME, _ANGLE, _SPEED, _LOAD, _VELOCITY, _BOUND, _QUIET, _WEIGHT, _LEARNED_MM, _LEARNED_MA, _ERROR = range(12)
-_STATE = 12
+_COUNT, _TIME, _ANGLE, _SPEED, _LOAD, _VELOCITY, _BOUND, _QUIET = range(8)
+_WEIGHT, _LEARNED_MM, _LEARNED_MA, _ERROR, _RUNS_AWAY, _LATE = range(8, 14)
+_STATE = 14
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,14 +152,14 @@ def follow_joint(numbers, count, joint, torque_acceleration, angle, speed, dt): 
 
     The first reading is taken as it is, the load as that of steady motion; by angle alone the second one gives the speed.
     """
-    by_angle = numbers[_ANGLE_ONLY] > 0.0
+    by_angle = numbers[ANGLE_ONLY] > 0.0
     if count == 0:
         joint[0], joint[1], joint[2] = angle, 0.0 if by_angle else speed, torque_acceleration
         return 0.0
     if by_angle and count == 1:
         joint[0], joint[1], joint[2] = angle, (angle - joint[0]) / dt, torque_acceleration
         return 0.0
-    bandwidth, layer, linear_share = numbers[_BANDWIDTH], numbers[_LAYER], numbers[_LINEAR_SHARE]
+    bandwidth, layer, linear_share = numbers[BANDWIDTH], numbers[LAYER], numbers[LINEAR_SHARE]
     if by_angle:
         joint[0], joint[1], joint[2], error = from_angle(
             joint[0], joint[1], joint[2], torque_acceleration, angle, dt, bandwidth, layer, linear_share
@@ -167,6 +170,12 @@ def follow_joint(numbers, count, joint, torque_acceleration, angle, speed, dt): 
             joint[1], joint[2], torque_acceleration, speed, dt, bandwidth, layer, linear_share
         )
     return error
+
+
+@compiled
+def late_load(numbers, before, load, dt):  # type: ignore[no-untyped-def]
+    """Return by how much a load that goes on changing like this is found late [rad/s^2]: two or three time constants."""
+    return (3.0 if numbers[ANGLE_ONLY] > 0.0 else 2.0) / numbers[BANDWIDTH] * abs(load - before) / dt
 
 
 @compiled
@@ -193,12 +202,13 @@ def _advance(wheel, tyre, numbers, state, angle, speed, torque, dt):  # type: ig
     inertia, radius, mass, normal_force = wheel[_INERTIA], wheel[_RADIUS], wheel[_MASS], wheel[_NORMAL_FORCE]
     count = state[_COUNT]
     torque_acceleration = torque / inertia
+    load_before = state[_LOAD]
     state[_ERROR] = follow_joint(numbers, count, state[_ANGLE : _LOAD + 1], torque_acceleration, angle, speed, dt)
     rolling = radius * state[_SPEED]
     force = inertia * state[_LOAD] / radius
     state[_COUNT] = count + 1.0
     state[_TIME] += dt
-    by_angle = numbers[_ANGLE_ONLY] > 0.0
+    by_angle = numbers[ANGLE_ONLY] > 0.0
     if count == 0.0 or (by_angle and count == 1.0):
         # Nothing is known yet but that a driven wheel does not push the ground backwards.
         state[_BOUND] = max(abs(rolling - state[_VELOCITY]), abs(rolling))
@@ -207,20 +217,28 @@ def _advance(wheel, tyre, numbers, state, angle, speed, torque, dt):  # type: ig
     acceleration = force / (mass * learned_mass_ratio(tolerance, state[_LEARNED_MM], state[_LEARNED_MA]))
     velocity = state[_VELOCITY] + dt * acceleration
     rolling_acceleration = radius * (torque_acceleration - state[_LOAD])
-    bound = grown_bound(numbers, state[_BOUND], acceleration, inertia * rolling_acceleration / (radius * radius * mass), dt)
+    per_acceleration = inertia / (radius * mass)
+    bound = grown_bound(
+        numbers, state[_BOUND], acceleration, per_acceleration * rolling_acceleration / radius, dt
+    )
+    # Forces that change are found late. That is told, but is no reason to believe another root.
+    state[_LATE] += dt * per_acceleration * late_load(numbers, load_before, state[_LOAD], dt)
     slip, _ = slip_of_force(tyre, force, 0.0, normal_force)
     root = velocity_of_slip(rolling, slip)
     reference = max(abs(rolling), abs(velocity), 1e-6)
     carried, _ = friction_coefficient(tyre, (rolling - velocity) / reference, 0.0)
     peak = tyre[MU] * normal_force
     explained = abs(carried * normal_force - force) <= EXPLAINED_SHARE * abs(force) + EXPLAINED_FLOOR * peak
+    averaged = 1.0 - math.exp(-dt / SLIP_ACCELERATION_MEMORY)
+    state[_RUNS_AWAY] += averaged * (rolling_acceleration - acceleration - state[_RUNS_AWAY])
     error_of_root, fade = root_error(numbers, abs(force) / peak, tyre[LAMBDA], reference)
     trust, state[_QUIET] = trust_of_root(
-        numbers, fade, error_of_root, rolling_acceleration - acceleration, acceleration, root - velocity, bound, explained,
+        numbers, fade, error_of_root, state[_RUNS_AWAY], acceleration, root - velocity, bound, explained,
         state[_QUIET], dt,
     )  # fmt: skip
     share = share_corrected(numbers, trust, dt)
     velocity += share * (root - velocity)
+    state[_LATE] *= 1.0 - share
     if trust > 0.0:
         bound = corrected_bound(max(bound, abs(root - velocity)), share, error_of_root)
     decay = math.exp(-dt / LEARNING_MEMORY)
@@ -238,7 +256,7 @@ def _advance(wheel, tyre, numbers, state, angle, speed, torque, dt):  # type: ig
 def _run(wheel, tyre, numbers, state, angle, speed, torque, dt, velocity, force, bound):  # type: ignore[no-untyped-def]
     for k in range(len(angle)):
         _, force[k] = _advance(wheel, tyre, numbers, state, angle[k], speed[k], torque[k], dt)
-        velocity[k], bound[k] = state[_VELOCITY], state[_BOUND]
+        velocity[k], bound[k] = state[_VELOCITY], state[_BOUND] + state[_LATE]
 
 
 class SlidingModeObserver:
@@ -283,13 +301,13 @@ class SlidingModeObserver:
             self._wheel, self._tyre, self._numbers, state, measurement.roll_angle, measurement.roll_rate,
             measurement.drive_torque, dt,
         )  # fmt: skip
-        velocity, bound, numbers = float(state[_VELOCITY]), float(state[_BOUND]), self._numbers
+        velocity, bound, numbers = float(state[_VELOCITY]), float(state[_BOUND] + state[_LATE]), self._numbers
         speed = max(abs(velocity), abs(rolling))
         settled = bool(
-            state[_TIME] > SETTLED_TIME_CONSTANTS / numbers[_BANDWIDTH] and abs(state[_ERROR]) <= numbers[_LAYER]
+            state[_TIME] > SETTLED_TIME_CONSTANTS / numbers[BANDWIDTH] and abs(state[_ERROR]) <= numbers[LAYER]
         )
         contradicted = mass_contradicted(numbers[MASS_TOLERANCE], state[_LEARNED_MM], state[_LEARNED_MA])
-        valid = bool(settled and not contradicted and bound <= numbers[_ACCURACY] * speed + numbers[_ACCURACY_FLOOR])
+        valid = bool(settled and not contradicted and bound <= numbers[ACCURACY] * speed + numbers[ACCURACY_FLOOR])
         ratio = ratio_of(rolling, velocity)
         estimate = WheelEstimate(velocity, float(state[_SPEED]), ratio, float(force), bound, valid, valid, settled)
         return state, estimate

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import tyre_parameters
 from pcw_description.robot_description import ContactDescription, FloatArray, RobotDescription
 from pcw_description.wheel_dynamics import slip_ratio
@@ -120,10 +121,19 @@ class JointMeasurement:
         """
         for name in names:
             values = getattr(self, name)
-            if values.shape != (n, 2) or not np.isfinite(values).all():
+            if values.shape != (n, 2) or not _all_finite(values):
                 raise EstimationError(
                     f"joint {name} = {values.tolist()} is not allowed; allowed: finite numbers, shape ({n}, 2)"
                 )
+
+
+@compiled
+def _all_finite(values):  # type: ignore[no-untyped-def]
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            if not math.isfinite(values[row, column]):
+                return False
+    return True
 
 
 @dataclasses.dataclass(frozen=True)
