@@ -1,8 +1,8 @@
 """When the lower root of mu(lambda) may be believed, and how far off an estimate may be meanwhile.
 
-Below its peak every friction coefficient belongs to two slip ratios. On the rising branch the force gives the slip, and with it
-the velocity; on the falling one that answer is wrong, and at the peak the slope is zero and the force says nothing. Three things
-that a wheel knows of itself tell the branches apart:
+Below its peak every friction coefficient belongs to two slip ratios. On the rising branch the force gives the slip, and with
+it the velocity; on the falling one that answer is wrong, and at the peak the slope is zero and the force says nothing. Three
+things that a wheel knows of itself tell the branches apart:
 
 - use: the part of the peak that the force takes. Towards the peak the root becomes vague, and trust fades unless less is known
   from elsewhere.
@@ -32,7 +32,7 @@ EXPLAINED_SHARE, EXPLAINED_FLOOR = 0.3, 0.05
 def root_error(numbers, use, critical_slip, speed):  # type: ignore[no-untyped-def]
     """Return how far off the velocity of the lower root may be [m/s], and how the trust in it fades with use [1].
 
-    Whatever the force, a wheel that grips slips less than its critical slip: beyond `no_trust_use` that is all there is to know.
+    Whatever the force, a wheel that grips slips less than its critical slip: beyond `no_trust_use` that is all that is known.
     """
     fade = (numbers[NO_TRUST_USE] - use) / (numbers[NO_TRUST_USE] - numbers[FULL_TRUST_USE])
     fade = min(max(fade, 0.0), 1.0)

@@ -1,11 +1,11 @@
 """Sliding-mode observer of a whole robot: n casters that share one chassis, (4.13)-(4.15) with (3.44) [Li2009].
 
-Every joint has its sliding mode (`joint_sliding_mode`), whose equivalent injection gives the load of the ground on it, and with
-the inertia of the module that turns with it the force in the wheel frame, B^T F = load. The chassis follows from all forces,
+Every joint has its sliding mode (`joint_sliding_mode`), whose equivalent injection gives the load of the ground on it, and
+with the inertia of the module that turns with it the force in the wheel frame, B^T F = load. The chassis follows from all,
 
     Lambda V_dot + theta = A^T F                                                                          (3.44)
 
-(`slipping_robot_dynamics`). The velocity is drawn to what the lower roots of the friction curves say of the wheel-centre velocities,
+(`slipping_robot_dynamics`). The velocity is drawn to what the lower roots of the friction curves say of each wheel centre,
 
     y_i = (B q_dot)_i - |v_i| (lambda_x, lambda_y)_i (F_i / F_zi),      V_hat += share (A^T W A)^-1 A^T W (y - A V_hat),
 
