@@ -59,6 +59,8 @@ from .sliding_mode_observer import (
     follow_joint,
     late_load,
     learned_mass_ratio,
+    load_share,
+    load_that_follows,
     mass_contradicted,
 )
 from .slip_estimate import RATIO_SPEED, JointMeasurement, SlipEstimate, require_dt
@@ -87,8 +89,8 @@ RIDGE = 1e-3
 
 # Columns of the state of a caster and of the state of the body.
 _DRIVE, _STEER, _QUIET, _TRUST, _DRIVE_ERROR, _STEER_ERROR, _FX, _FY, _FZ = 0, 3, 6, 7, 8, 9, 10, 11, 12
-_RUNS_X, _RUNS_Y = 13, 14
-_WHEEL_STATE = 15
+_RUNS_X, _RUNS_Y, _TORQUE = 13, 14, 15
+_WHEEL_STATE = 16
 _COUNT, _TIME, _V, _A, _BOUND, _LEARNED_MM, _LEARNED_MA, _LATE = 0, 1, 2, 5, 8, 9, 10, 11
 _BODY_STATE = 12
 _SPEED, _LOAD = 1, 2
@@ -109,7 +111,7 @@ def _advance(  # type: ignore[no-untyped-def]
     steer_angle = np.empty(n)
     part = np.zeros((n, 8))
     joint_acceleration = np.empty((n, 2))
-    late = 0.0
+    late, mass_share = 0.0, chassis[0] / n
     for i in range(n):
         wheel = wheels[i]
         j_rr, j_rp = casters[i, J_RR], casters[i, J_RP]
@@ -117,6 +119,11 @@ def _advance(  # type: ignore[no-untyped-def]
         determinant = j_rr * j_ss - j_rp * j_rp
         by_torque_r = (j_ss * effort[i, 0] - j_rp * effort[i, 1]) / determinant
         by_torque_p = (j_rr * effort[i, 1] - j_rp * effort[i, 0]) / determinant
+        # While a wheel grips its load follows its torque at once; what is left for the injection to find is slow.
+        follows = load_share(j_rr, casters[i, RADIUS], mass_share) * wheel[_TRUST] * (by_torque_r - wheel[_TORQUE])
+        wheel[_TORQUE] = by_torque_r
+        most = casters[i, RADIUS] * casters[i, TYRE + MU] * wheel[_FZ] / j_rr
+        wheel[_DRIVE + _LOAD] = load_that_follows(wheel[_DRIVE + _LOAD], follows, most)
         load_before = wheel[_DRIVE + _LOAD]
         wheel[_DRIVE_ERROR] = follow_joint(
             numbers, count, wheel[_DRIVE : _DRIVE + 3], by_torque_r, position[i, 0], velocity[i, 0], dt

@@ -62,8 +62,8 @@ BANDWIDTH, LAYER, LINEAR_SHARE, ANGLE_ONLY, ACCURACY, ACCURACY_FLOOR = range(TRU
 _INERTIA, _RADIUS, _MASS, _NORMAL_FORCE = range(4)
 # Layout of the state.
 _COUNT, _TIME, _ANGLE, _SPEED, _LOAD, _VELOCITY, _BOUND, _QUIET = range(8)
-_WEIGHT, _LEARNED_MM, _LEARNED_MA, _ERROR, _RUNS_AWAY, _LATE = range(8, 14)
-_STATE = 14
+_WEIGHT, _LEARNED_MM, _LEARNED_MA, _ERROR, _RUNS_AWAY, _LATE, _TORQUE = range(8, 15)
+_STATE = 15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +173,22 @@ def follow_joint(numbers, count, joint, torque_acceleration, angle, speed, dt): 
 
 
 @compiled
+def load_share(inertia, radius, mass):  # type: ignore[no-untyped-def]
+    """Return the part of a wheel's torque that the ground takes while it rolls along with its mass [1]."""
+    carried = mass * radius * radius
+    return carried / (carried + inertia)
+
+
+@compiled
+def load_that_follows(load, change, most):  # type: ignore[no-untyped-def]
+    """Return a load after a change of torque [rad/s^2]; the ground takes no more than its peak."""
+    changed = load + change
+    if abs(changed) > most and abs(changed) > abs(load):
+        return math.copysign(max(most, abs(load)), changed)
+    return changed
+
+
+@compiled
 def late_load(numbers, before, load, dt):  # type: ignore[no-untyped-def]
     """Return by how much a load that goes on changing like this is found late [rad/s^2]: two or three time constants."""
     return (3.0 if numbers[ANGLE_ONLY] > 0.0 else 2.0) / numbers[BANDWIDTH] * abs(load - before) / dt
@@ -202,6 +218,10 @@ def _advance(wheel, tyre, numbers, state, angle, speed, torque, dt):  # type: ig
     inertia, radius, mass, normal_force = wheel[_INERTIA], wheel[_RADIUS], wheel[_MASS], wheel[_NORMAL_FORCE]
     count = state[_COUNT]
     torque_acceleration = torque / inertia
+    # While the wheel grips its load follows its torque at once; what is left for the injection to find is slow.
+    change = load_share(inertia, radius, mass) * state[_WEIGHT] * (torque_acceleration - state[_TORQUE])
+    state[_LOAD] = load_that_follows(state[_LOAD], change, radius * tyre[MU] * normal_force / inertia)
+    state[_TORQUE] = torque_acceleration
     load_before = state[_LOAD]
     state[_ERROR] = follow_joint(numbers, count, state[_ANGLE : _LOAD + 1], torque_acceleration, angle, speed, dt)
     rolling = radius * state[_SPEED]

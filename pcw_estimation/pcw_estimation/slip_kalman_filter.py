@@ -70,8 +70,8 @@ class SlipKalmanParameters:
         accuracy, accuracy_floor: a velocity is valid while two standard deviations are below accuracy times speed plus floor.
     """
 
-    force_error: float = 0.2
-    joint_error: float = 5.0
+    force_error: float = 0.05
+    joint_error: float = 60.0
     speed_noise: float = 0.01
     initial_error: float = 1.0
     accuracy: float = 0.1
