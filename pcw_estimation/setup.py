@@ -40,6 +40,7 @@ setup(
         "console_scripts": [
             "encoder_slip = pcw_estimation.nodes.encoder_slip:main",
             "odometry = pcw_estimation.nodes.odometry:main",
+            "slip_observer = pcw_estimation.nodes.slip_observer:main",
         ],
     },
 )

@@ -23,6 +23,7 @@ NODES = {
     "odometry": ("pcw_estimation.nodes.odometry", "OdometryNode"),
     "recorder": ("pcw_sim_bridge.nodes.recorder", "RecorderNode"),
     "robot_description": ("pcw_description.nodes.robot_description", "RobotDescriptionNode"),
+    "slip_observer": ("pcw_estimation.nodes.slip_observer", "SlipObserverNode"),
     "transforms": ("pcw_description.nodes.transforms", "TransformsNode"),
 }
 

@@ -1,4 +1,4 @@
-"""What a robot knows of its own motion: odometry, and slip from what the encoders contradict.
+"""What a robot knows of its own motion: odometry, and slip from encoders and from motor torques.
 
 ros2 launch pcw_estimation estimation.launch.py robot:=tidybot2 publish_tf:=false
 """
@@ -23,5 +23,6 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[{"robot": robot, "publish_tf": publish_tf}],
             ),
             Node(package="pcw_estimation", executable="encoder_slip", output="screen", parameters=[{"robot": robot}]),
+            Node(package="pcw_estimation", executable="slip_observer", output="screen", parameters=[{"robot": robot}]),
         ]
     )

@@ -396,5 +396,7 @@ class RobotSlidingModeObserver:
             *self._constants, state.body, state.wheels, measurement.position, measurement.velocity, measurement.effort, dt
         )
         result, bound, valid = _estimate(self._numbers, body, wheels, sensed, jacobian)
-        estimate = SlipEstimate(body[_V : _V + 3].copy(), *result, bound, *valid)
+        estimate = SlipEstimate(
+            body[_V : _V + 3].copy(), result[0], result[1], result[2], result[3], bound, valid[0], valid[1], valid[2]
+        )
         return RobotObserverState(body, wheels), estimate

@@ -54,6 +54,8 @@ from .slipping_robot_dynamics import (
     wheel_loads,
 )
 
+# A prediction goes in parts of at most this [s]: the friction curve bends within longer ones.
+LONGEST_PART = 1e-3
 # Differences for J [m/s or rad/s].
 DIFFERENCE = 1e-4
 
@@ -125,18 +127,20 @@ def _wheel_step(wheel, tyre, numbers, x, covariance, speed, torque, dt, first): 
         covariance[:, :] = 0.0
         covariance[0, 0], covariance[1, 1] = numbers[2] ** 2, numbers[3] ** 2
     else:
-        rates, _ = _wheel_rates(wheel, tyre, x, torque)
-        implicit = np.eye(2)
-        for k in range(2):
-            moved = x.copy()
-            moved[k] += DIFFERENCE
-            other, _ = _wheel_rates(wheel, tyre, moved, torque)
-            implicit[:, k] -= dt * (other - rates) / DIFFERENCE
-        phi = np.linalg.inv(implicit)
-        x += phi @ (dt * rates)
-        covariance[:, :] = phi @ covariance @ phi.T
-        covariance[0, 0] += dt * numbers[1] ** 2
-        covariance[1, 1] += dt * numbers[0] ** 2
+        parts = math.ceil(dt / LONGEST_PART - 1e-9)
+        for _ in range(parts):
+            rates, _ = _wheel_rates(wheel, tyre, x, torque)
+            implicit = np.eye(2)
+            for k in range(2):
+                moved = x.copy()
+                moved[k] += DIFFERENCE
+                other, _ = _wheel_rates(wheel, tyre, moved, torque)
+                implicit[:, k] -= dt / parts * (other - rates) / DIFFERENCE
+            phi = np.linalg.inv(implicit)
+            x += phi @ (dt / parts * rates)
+            covariance[:, :] = phi @ covariance @ phi.T
+            covariance[0, 0] += dt / parts * numbers[1] ** 2
+            covariance[1, 1] += dt / parts * numbers[0] ** 2
         _update(x, covariance, 0, speed, numbers[2] ** 2)
     _, force = _wheel_rates(wheel, tyre, x, torque)
     return force
@@ -275,20 +279,22 @@ def _robot_step(  # type: ignore[no-untyped-def]
                 x[3 + 2 * i + axis] = velocity[i, axis]
                 covariance[3 + 2 * i + axis, 3 + 2 * i + axis] = numbers[2] ** 2
     else:
-        rates, _ = _robot_rates(casters, steer_axis, caster_offset, composite, normal, jacobian, steer_angle, x, effort)
-        implicit = np.eye(size)
-        for k in range(size):
-            moved = x.copy()
-            moved[k] += DIFFERENCE
-            other, _ = _robot_rates(
-                casters, steer_axis, caster_offset, composite, normal, jacobian, steer_angle, moved, effort
-            )
-            implicit[:, k] -= dt * (other - rates) / DIFFERENCE
-        phi = np.linalg.inv(implicit)
-        x += phi @ (dt * rates)
-        covariance[:, :] = phi @ covariance @ phi.T
-        for k in range(size):
-            covariance[k, k] += dt * numbers[0 if k < 3 else 1] ** 2
+        parts = math.ceil(dt / LONGEST_PART - 1e-9)
+        for _ in range(parts):
+            rates, _ = _robot_rates(casters, steer_axis, caster_offset, composite, normal, jacobian, steer_angle, x, effort)
+            implicit = np.eye(size)
+            for k in range(size):
+                moved = x.copy()
+                moved[k] += DIFFERENCE
+                other, _ = _robot_rates(
+                    casters, steer_axis, caster_offset, composite, normal, jacobian, steer_angle, moved, effort
+                )
+                implicit[:, k] -= dt / parts * (other - rates) / DIFFERENCE
+            phi = np.linalg.inv(implicit)
+            x += phi @ (dt / parts * rates)
+            covariance[:, :] = phi @ covariance @ phi.T
+            for k in range(size):
+                covariance[k, k] += dt / parts * numbers[0 if k < 3 else 1] ** 2
         for i in range(n):
             for axis in range(2):
                 _update(x, covariance, 3 + 2 * i + axis, velocity[i, axis], numbers[2] ** 2)

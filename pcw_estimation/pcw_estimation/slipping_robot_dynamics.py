@@ -3,8 +3,8 @@
     Lambda V_dot + theta = A^T F
 
 Lambda is that of chassis and modules as one body at the present headings, and theta holds what the modules take that turn
-under it at the rates measured. The augmented object of a robot that rolls has these rates from V instead: with a wheel that slips
-across, and over a short caster offset, a small error of V would become a large force.
+under it at the rates measured. The augmented object of a robot that rolls has these rates from V instead: with a wheel that
+slips across, and over a short caster offset, a small error of V would become a large force.
 """
 
 from __future__ import annotations

@@ -199,20 +199,20 @@ def document(wheel: WheelModel, seeds: range, out: Path) -> str:
         "",
         f"Written by `python -m pcw_estimation.studies.observer_study --seeds {len(seeds)}`; nothing here is typed in.",
         "",
-        f"The wheel is one of the `{ROBOT}` robot with a quarter of its mass: M = {wheel.mass:.2f} kg, I = {wheel.inertia:.4f} kg "
-        f"m^2, r = {wheel.radius:g} m, mu_p = {wheel.contact.mu_p:g}, lambda_p = {wheel.contact.lambda_p:g}, relaxation length "
-        f"{wheel.contact.relaxation_length:g} m. Encoder: 4096 counts on the motor behind a gear of 20; speeds with 0.005 rad/s, "
-        "torques with 0.02 N m of noise; 1000 readings a second unless stated.",
+        f"The wheel is one of the `{ROBOT}` robot with a quarter of its mass: M = {wheel.mass:.2f} kg, I = {wheel.inertia:.4f}"
+        f" kg m^2, r = {wheel.radius:g} m, mu_p = {wheel.contact.mu_p:g}, lambda_p = {wheel.contact.lambda_p:g}, relaxation "
+        f"length {wheel.contact.relaxation_length:g} m. Encoder: 4096 counts on the motor behind a gear of 20; speeds with "
+        "0.005 rad/s, torques with 0.02 N m of noise; 1000 readings a second unless stated.",
         "",
         "## Figures 4.3 and 4.4",
         "",
         *figures(wheel, out),
         "## Robustness",
         "",
-        "Every run has a wheel under way at 0.4 to 1.5 m/s that drives, is given 1.1 to 1.4 times what the ground holds for 0.1 "
-        "to 0.3 s, drives or coasts, and brakes. The observer begins at v = 0 and believes in numbers that are off: M, I, mu_p and "
-        "lambda_p by up to what is stated, r too. Errors are relative to the speed, RMS over all runs together; spin is where "
-        "the slip ratio is above lambda_p.",
+        "Every run has a wheel under way at 0.4 to 1.5 m/s that drives, is given 1.1 to 1.4 times what the ground holds for "
+        "0.1 to 0.3 s, drives or coasts, and brakes. The observer begins at v = 0 and believes in numbers that are off: M, I, "
+        "mu_p and lambda_p by up to what is stated, r too. Errors are relative to the speed, RMS over all runs together; spin "
+        "is where the slip ratio is above lambda_p.",
         "",
         *robustness(wheel, seeds),
         "",

@@ -106,7 +106,7 @@ def run_wheel(
     else:
         rate = motion[:, 1] + sensors.rate_noise * rng.standard_normal(len(torque))
     return WheelRun(
-        time=period * np.arange(len(torque)),
+        time=period * np.arange(len(torque), dtype=float),
         velocity=motion[:, 2],
         slip_ratio=motion[:, 4],
         force=motion[:, 3],
