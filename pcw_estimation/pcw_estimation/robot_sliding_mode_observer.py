@@ -57,6 +57,7 @@ from .sliding_mode_observer import (
     SLIP_ACCELERATION_MEMORY,
     SlidingModeParameters,
     follow_joint,
+    forces_found,
     late_load,
     learned_mass_ratio,
     load_share,
@@ -203,7 +204,9 @@ def _advance(  # type: ignore[no-untyped-def]
     # Forces that change are found late. That is told, but is no reason to believe another root.
     body[_LATE] += dt * late / mass
     least_error, trusted = math.inf, 0
-    averaged = 1.0 - math.exp(-dt / SLIP_ACCELERATION_MEMORY)
+    # Forces that are not found yet say nothing of grip: until then every reading begins anew.
+    found = forces_found(numbers, body[_TIME])
+    averaged = 1.0 - math.exp(-dt / SLIP_ACCELERATION_MEMORY) if found else 1.0
     for i in range(n):
         wheel, tyre = wheels[i], casters[i, TYRE:]
         wheel[_TRUST] = 0.0
@@ -250,6 +253,7 @@ def _advance(  # type: ignore[no-untyped-def]
             wheel[_QUIET],
             dt,
         )
+        trust = trust if found else 0.0
         wheel[_TRUST] = trust
         part[i, _ERROR_OF_ROOT], part[i, _FADE] = error_of_root, fade
         part[i, _SEEN] = rolled_x - abs(slip_x) * casters[i, RADIUS] * joint_acceleration[i, 0]

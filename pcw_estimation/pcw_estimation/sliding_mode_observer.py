@@ -54,7 +54,8 @@ LEARNING_MEMORY, LEARNING_PRIOR = 2.0, 0.5
 CONTRADICTION_FLOOR = 0.05
 # Slip acceleration is averaged over this time [s]: noise and a controller's ripple are no slip.
 SLIP_ACCELERATION_MEMORY = 0.01
-# Forces count as found after so many time constants of the joint observers.
+# Forces are looked at after so many time constants of the joint observers, by speed or angle, and vouched for after so many.
+FOUND_BY_SPEED, FOUND_BY_ANGLE = 3.0, 5.0
 SETTLED_TIME_CONSTANTS = 5.0
 
 # Layout of the numbers of the observer; those of trust come first.
@@ -92,7 +93,7 @@ class SlidingModeParameters:
     full_trust_use: float = 0.6
     no_trust_use: float = 0.85
     slip_acceleration: float = 0.6
-    slip_acceleration_share: float = 0.35
+    slip_acceleration_share: float = 0.25
     conflict_floor: float = 0.01
     conflict_share: float = 0.03
     recapture_time: float = 0.15
@@ -173,6 +174,12 @@ def follow_joint(numbers, count, joint, torque_acceleration, angle, speed, dt): 
 
 
 @compiled
+def forces_found(numbers, time):  # type: ignore[no-untyped-def]
+    """Return whether the injection has had the time to find the forces."""
+    return time * numbers[BANDWIDTH] >= (FOUND_BY_ANGLE if numbers[ANGLE_ONLY] > 0.0 else FOUND_BY_SPEED)
+
+
+@compiled
 def load_share(inertia, radius, mass):  # type: ignore[no-untyped-def]
     """Return the part of a wheel's torque that the ground takes while it rolls along with its mass [1]."""
     carried = mass * radius * radius
@@ -249,13 +256,16 @@ def _advance(wheel, tyre, numbers, state, angle, speed, torque, dt):  # type: ig
     carried, _ = friction_coefficient(tyre, (rolling - velocity) / reference, 0.0)
     peak = tyre[MU] * normal_force
     explained = abs(carried * normal_force - force) <= EXPLAINED_SHARE * abs(force) + EXPLAINED_FLOOR * peak
-    averaged = 1.0 - math.exp(-dt / SLIP_ACCELERATION_MEMORY)
+    # Forces that are not found yet say nothing of grip: until then every reading begins anew.
+    found = forces_found(numbers, state[_TIME])
+    averaged = 1.0 - math.exp(-dt / SLIP_ACCELERATION_MEMORY) if found else 1.0
     state[_RUNS_AWAY] += averaged * (rolling_acceleration - acceleration - state[_RUNS_AWAY])
     error_of_root, fade = root_error(numbers, abs(force) / peak, tyre[LAMBDA], reference)
     trust, state[_QUIET] = trust_of_root(
         numbers, fade, error_of_root, state[_RUNS_AWAY], acceleration, root - velocity, bound, explained,
         state[_QUIET], dt,
     )  # fmt: skip
+    trust = trust if found else 0.0
     share = share_corrected(numbers, trust, dt)
     velocity += share * (root - velocity)
     state[_LATE] *= 1.0 - share

@@ -248,9 +248,10 @@ def table(names: Sequence[str], seeds: int, all_wheels: bool, error: float) -> l
             force = float(np.sqrt(np.mean([s.force**2 for s in found])))
             lines.append(
                 f"| {name} | {method} | {1e3 * float(np.median([s.settling for s in found])):.0f} ms | "
-                f"{rms['grip']:.1f} mm/s | {rms['slip']:.1f} mm/s | {rms['after']:.1f} mm/s | {1e3 * max(s.worst for s in found):.0f} mm/s | "
-                f"{'-' if np.isnan(force) else f'{force:.1f} N'} | {np.mean([s.valid for s in found]):.0%} | "
-                f"{np.mean([s.outside for s in found]):.1%} | {min(s.cost for s in found):.0f} us |"
+                f"{rms['grip']:.1f} mm/s | {rms['slip']:.1f} mm/s | {rms['after']:.1f} mm/s | "
+                f"{1e3 * max(s.worst for s in found):.0f} mm/s | {'-' if np.isnan(force) else f'{force:.1f} N'} | "
+                f"{np.mean([s.valid for s in found]):.0%} | {np.mean([s.outside for s in found]):.1%} | "
+                f"{min(s.cost for s in found):.0f} us |"
             )
             print(lines[-1], flush=True)
     return lines
@@ -271,11 +272,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"Written by `python -m pcw_sim_bridge.slip_observer_comparison --seeds {options.seeds}`; nothing here is typed in.",
         "",
         f"Runs of {DURATION:g} s of the reduced plant along a turning twist, with the sensors of the robot file. At "
-        f"{PUSH_FROM:g} s drives get {PUSH:g} times the torque that the ground holds for {PUSH_UNTIL - PUSH_FROM:.1f} s, within "
-        f"their limits. Observers begin at {BEGIN:g} s, while the robot moves, the sliding-mode ones at v = 0. Errors are of all "
-        "wheel-centre velocities, along and across: in grip before the push, in slip, and after it. Settling: from the beginning "
-        "until below 5 % of the run's greatest speed. `valid`: readings at which all velocities are vouched for (the encoders "
-        "vouch for nothing). Cost: a call from Python on this machine, the best run's mean.",
+        f"{PUSH_FROM:g} s drives get {PUSH:g} times the torque that the ground holds for {PUSH_UNTIL - PUSH_FROM:.1f} s, "
+        f"within their limits. Observers begin at {BEGIN:g} s, while the robot moves, the sliding-mode ones at v = 0. Errors "
+        "are of all wheel-centre velocities, along and across: in grip before the push, in slip, and after it. Settling: from "
+        "the beginning until below 5 % of the run's greatest speed. `valid`: readings at which all velocities are vouched for "
+        "(the encoders vouch for nothing). Cost: a call from Python on this machine, the best run's mean.",
         "",
     ]
     for title, all_wheels, error in (
