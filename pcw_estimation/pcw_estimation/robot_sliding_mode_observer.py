@@ -88,6 +88,9 @@ LEAST_LOAD = 0.05
 # Directions of motion that the trusted wheels do not determine are left alone by a ridge of this size.
 RIDGE = 1e-3
 
+# No robot on casters is faster, or turns faster [m/s], [rad/s].
+FASTEST, FASTEST_TURNING = 100.0, 300.0
+
 # Columns of the state of a caster and of the state of the body.
 _DRIVE, _STEER, _QUIET, _TRUST, _DRIVE_ERROR, _STEER_ERROR, _FX, _FY, _FZ = 0, 3, 6, 7, 8, 9, 10, 11, 12
 _RUNS_X, _RUNS_Y, _TORQUE = 13, 14, 15
@@ -298,6 +301,10 @@ def _advance(  # type: ignore[no-untyped-def]
             body[_LEARNED_MM] += dt * mm / n
             body[_LEARNED_MA] += dt * ma / n
     body[_BOUND] = bound
+    # Readings that belong to no robot can drive it anywhere: it then begins anew.
+    if not (abs(twist[0]) + abs(twist[1]) < FASTEST and abs(twist[2]) < FASTEST_TURNING):
+        body[:] = 0.0
+        wheels[:] = 0.0
     return body, wheels, part[:, _SENSED_X : _SENSED_Y + 1].copy(), jacobian
 
 

@@ -141,6 +141,8 @@ class SlipObserverNode(Node):
             level, text = WARN, problems
         elif self._silence.since_last_report():
             level, text = WARN, "no joint_states since the last report"
+        elif estimate is None or not estimate.velocity_valid.any():
+            level, text = WARN, "no velocity is vouched for"
         return Status(level, text, values)
 
 
