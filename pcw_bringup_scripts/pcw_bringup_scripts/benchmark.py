@@ -38,6 +38,9 @@ from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 from pcw_description.robot_file import load_robot
+from pcw_estimation.robot_sliding_mode_observer import RobotSlidingModeObserver
+from pcw_estimation.sliding_mode_observer import SlidingModeParameters
+from pcw_estimation.slip_estimate import JointMeasurement
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import Plant
 from pcw_sim_bridge.sensors import JointReading
@@ -153,6 +156,31 @@ def augmented_object(robot: RobotDescription) -> Callable[[], float]:
     return work
 
 
+def slip_observer(measured: str) -> Prepare:
+    """The sliding-mode observer of the whole robot, one step on joints that move, with all its checks and flags."""
+
+    def prepare(robot: RobotDescription) -> Callable[[], float]:
+        calls, dt = 2000, 2e-3
+        rng = np.random.default_rng(3)
+        moments = dt * np.arange(calls)[:, None, None] * np.ones((1, robot.n, 2))
+        positions = np.cumsum(5.0 + np.sin(moments), axis=0) * dt
+        positions[:, :, STEER] = 0.5 * np.sin(moments[:, :, STEER])
+        velocities = np.gradient(positions, dt, axis=0) + rng.normal(0.0, 0.005, positions.shape)
+        efforts = rng.normal(0.0, 0.2, positions.shape)
+        observer = RobotSlidingModeObserver(robot, SlidingModeParameters(measured=measured))
+        readings = [JointMeasurement(*reading) for reading in zip(positions, velocities, efforts, strict=True)]
+
+        def work() -> float:
+            state = observer.initial_state()
+            for reading in readings:
+                state, _ = observer.step(state, reading, dt)
+            return calls
+
+        return work
+
+    return prepare
+
+
 def with_all_effects(prepare: Prepare) -> Prepare:
     """The same task with every effect of the vocabulary at work, at its typical size, on all casters."""
 
@@ -249,6 +277,8 @@ TASKS = (
     Task("forward kinematics and odometry, one update", MICROSECONDS, 20.0, odometry_update("differential")),
     Task("the same by the displacement model", MICROSECONDS, None, odometry_update("displacement")),
     Task("Lambda and theta", MICROSECONDS, 5.0, augmented_object),
+    Task("slip observer of the robot, from speeds", MICROSECONDS, 40.0, slip_observer("speed")),
+    Task("angle-only slip observer of the robot", MICROSECONDS, 40.0, slip_observer("angle")),
     Task("reduced plant at 1 ms, in batch", REAL_TIME, 800.0, reduced_in_batch),
     Task("reduced plant at 1 ms, stepped from Python", REAL_TIME, 200.0, reduced_stepped(read=False)),
     Task("the same, its state read after each step", REAL_TIME, None, reduced_stepped(read=True)),

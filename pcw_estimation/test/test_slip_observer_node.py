@@ -134,30 +134,32 @@ def test_gaps_and_stamps_that_repeat_or_go_back_are_counted_and_it_begins_anew(r
     assert all(np.isfinite([*m.position, *m.velocity, *m.effort]).all() for m in slip)
 
 
-@pytest.mark.parametrize("field", ["position", "velocity", "effort"])
-def test_nan_and_missing_fields_are_left_out_and_told(ros, field):
+def test_nan_and_missing_fields_are_left_out_and_told(ros):
     _, slip, diagnostics, robot = start(ros)
-    robot.run(lambda: len(slip) > 20)
+    for field in ("position", "velocity", "effort"):
+        count = len(slip)
+        robot.run(lambda: len(slip) > count + 20)  # noqa: B023 - it is waited for here
 
-    def with_nan(message):
-        getattr(message, field)[3] = math.nan
-        return message
+        def with_nan(message):
+            getattr(message, field)[3] = math.nan  # noqa: B023
+            return message
 
-    robot.change = with_nan
-    robot.publish(2)
-    ros.wait_for(lambda: f"joint {field}" in said(diagnostics))
-    robot.change = lambda message: message
-    count = len(slip)
-    robot.run(lambda: len(slip) > count + 5)
-    assert len(slip[-1].velocity) > 0  # two readings were bridged
+        robot.change = with_nan
+        robot.publish(2)
+        ros.wait_for(lambda: f"joint {field}" in said(diagnostics))  # noqa: B023
+        robot.change = lambda message: message
+        count = len(slip)
+        robot.run(lambda: len(slip) > count + 5)  # noqa: B023
+        assert len(slip[-1].velocity) > 0  # two readings were bridged
 
-    def without(message):
-        setattr(message, field, [])
-        return message
+        def without(message):
+            setattr(message, field, [])  # noqa: B023
+            return message
 
-    robot.change = without
-    before = int(values_of(diagnostics).get("unusable_joint_states", 0))
-    robot.run(lambda: int(values_of(diagnostics).get("unusable_joint_states", 0)) > before + 20)
+        robot.change = without
+        before = int(values_of(diagnostics).get("unusable_joint_states", 0))
+        robot.run(lambda: int(values_of(diagnostics).get("unusable_joint_states", 0)) > before + 20)  # noqa: B023
+        robot.change = lambda message: message
     assert all(np.isfinite([*m.position, *m.velocity, *m.effort]).all() for m in slip)
 
 
