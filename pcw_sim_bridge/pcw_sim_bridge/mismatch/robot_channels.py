@@ -42,7 +42,7 @@ from .signal_filter import SignalFilter
 # Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
 SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
-SLIP_DEVIATION = 0.15
+SLIP_DEVIATION = 0.3
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
