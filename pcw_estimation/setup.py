@@ -34,13 +34,16 @@ setup(
     zip_safe=False,
     maintainer="PCW maintainers",
     maintainer_email="pcw-maintainers@example.org",
-    description="Estimators for powered-caster robots: odometry and encoder-consistency slip detection.",
+    description="Estimators for powered-caster robots: slip from encoders and IMU, faults of joints, odometry.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "calibrate = pcw_estimation.slip_calibration:main",
             "encoder_slip = pcw_estimation.nodes.encoder_slip:main",
+            "imu_slip = pcw_estimation.nodes.imu_slip:main",
             "odometry = pcw_estimation.nodes.odometry:main",
             "slip_observer = pcw_estimation.nodes.slip_observer:main",
+            "slip_fusion = pcw_estimation.nodes.slip_fusion:main",
         ],
     },
 )

@@ -32,14 +32,17 @@ from pcw_control.computed_torque import (
 )
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.augmented_object_model import AugmentedObjectModel
+from pcw_description.differential_kinematics import inverse_kinematics
 from pcw_description.effects.registry import all_effects, read_physics
 from pcw_description.errors import PcwError
 from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 from pcw_description.robot_file import load_robot
+from pcw_estimation.imu_slip import ImuSlip
 from pcw_estimation.robot_sliding_mode_observer import RobotSlidingModeObserver
 from pcw_estimation.sliding_mode_observer import SlidingModeParameters
+from pcw_estimation.slip_consensus import SlipConsensus
 from pcw_estimation.slip_estimate import JointMeasurement
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import Plant
@@ -134,6 +137,57 @@ def odometry_update(method: str) -> Prepare:
             state = start
             for joint_position in angles:
                 state, _ = update(robot, parameters, state, joint_position, dt)
+            return calls
+
+        return work
+
+    return prepare
+
+
+def slip_detection(n_slipping: int) -> Prepare:
+    """Which wheels slip, from noisy joints; with slip the search for them is at work."""
+
+    def prepare(robot: RobotDescription) -> Callable[[], float]:
+        calls, dt = 2000, 2e-3
+        rng = np.random.default_rng(3)
+        detector, twist = SlipConsensus(robot), np.array([0.5, 0.1, 0.2])
+        position = np.zeros((robot.n, 2))
+        velocity = inverse_kinematics(robot, position[:, STEER].copy(), twist)
+        velocity[:n_slipping, DRIVE] += 0.3 / robot.wheel_radius[:n_slipping]
+        velocities = velocity + rng.normal(0.0, robot.sensors.encoders.velocity_noise, (calls, robot.n, 2))
+        start, _ = detector.step(detector.initial_state(), position, velocities[0], 0.0)
+
+        def work() -> float:
+            state = start
+            for joint_velocity in velocities:
+                state, _ = detector.step(state, position, joint_velocity, dt)
+            return calls
+
+        return work
+
+    return prepare
+
+
+def imu_slip(part: str) -> Prepare:
+    """The filter of encoders and IMU: `predict` with each IMU sample or `correct` with each measurement of the joints."""
+
+    def prepare(robot: RobotDescription) -> Callable[[], float]:
+        calls, rng = 2000, np.random.default_rng(4)
+        slip_filter, position = ImuSlip(robot), np.zeros((robot.n, 2))
+        velocity = inverse_kinematics(robot, position[:, STEER].copy(), np.array([0.5, 0.0, 0.0]))
+        velocities = velocity + rng.normal(0.0, robot.sensors.encoders.velocity_noise, (calls, robot.n, 2))
+        samples = rng.normal(0.0, 0.002, (calls, 3)).tolist()
+        start, _ = slip_filter.correct(slip_filter.initial_state(), position, velocity, 0.0)
+        start = slip_filter.predict(start, 0.0, 0.0, 0.0, 1e-3)
+
+        def work() -> float:
+            state = start
+            if part == "predict":
+                for gyro, x, y in samples:
+                    state = slip_filter.predict(state, gyro, x, y, 1e-3)
+            else:
+                for joint_velocity in velocities:
+                    state, _ = slip_filter.correct(state, position, joint_velocity, 2e-3)
             return calls
 
         return work
@@ -276,6 +330,10 @@ def with_controller(plant_name: str, seconds: float) -> Prepare:
 TASKS = (
     Task("forward kinematics and odometry, one update", MICROSECONDS, 20.0, odometry_update("differential")),
     Task("the same by the displacement model", MICROSECONDS, None, odometry_update("displacement")),
+    Task("slip of encoders, all wheels roll, one step", MICROSECONDS, 15.0, slip_detection(0)),
+    Task("the same, one wheel slips", MICROSECONDS, 15.0, slip_detection(1)),
+    Task("slip by IMU, one sample of it", MICROSECONDS, 5.0, imu_slip("predict")),
+    Task("the same, one measurement of the joints", MICROSECONDS, None, imu_slip("correct")),
     Task("Lambda and theta", MICROSECONDS, 5.0, augmented_object),
     Task("slip observer of the robot, from speeds", MICROSECONDS, 40.0, slip_observer("speed")),
     Task("angle-only slip observer of the robot", MICROSECONDS, 40.0, slip_observer("angle")),

@@ -18,12 +18,14 @@ NODES = {
     "bridge": ("pcw_sim_bridge.nodes.bridge", "BridgeNode"),
     "computed_torque": ("pcw_control.nodes.computed_torque", "ComputedTorqueNode"),
     "encoder_slip": ("pcw_estimation.nodes.encoder_slip", "EncoderSlipNode"),
+    "imu_slip": ("pcw_estimation.nodes.imu_slip", "ImuSlipNode"),
     "markers": ("pcw_sim_bridge.nodes.markers", "MarkersNode"),
     "mismatch_monitor": ("pcw_sim_bridge.nodes.mismatch_monitor", "MismatchMonitorNode"),
     "odometry": ("pcw_estimation.nodes.odometry", "OdometryNode"),
     "recorder": ("pcw_sim_bridge.nodes.recorder", "RecorderNode"),
     "robot_description": ("pcw_description.nodes.robot_description", "RobotDescriptionNode"),
     "slip_observer": ("pcw_estimation.nodes.slip_observer", "SlipObserverNode"),
+    "slip_fusion": ("pcw_estimation.nodes.slip_fusion", "SlipFusionNode"),
     "transforms": ("pcw_description.nodes.transforms", "TransformsNode"),
 }
 

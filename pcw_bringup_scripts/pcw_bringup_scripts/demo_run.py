@@ -40,7 +40,7 @@ from pcw_control.excitation import SHORTEST
 from pcw_description import AugmentedObjectModel, RobotDescription, load_robot, odometry, save_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.errors import PcwError
-from pcw_estimation import encoder_slip
+from pcw_estimation import FaultIsolation, SlipConsensus
 from pcw_sim_bridge.plants.factory import make_plant
 
 from .supervised_processes import Child, Children, ProcessError
@@ -125,8 +125,9 @@ def compile_inner_loops(nominal: RobotDescription, plant_name: str) -> None:
     plant.close()
     state, _ = odometry.update(nominal, odometry.OdometryParameters(), odometry.initial_state(), at_rest, 1.0)
     odometry.update(nominal, odometry.OdometryParameters(), state, at_rest, 1.0)
-    thresholds, no_slip = encoder_slip.EncoderSlipParameters(), encoder_slip.initial_state(nominal)
-    encoder_slip.step(nominal, thresholds, no_slip, at_rest, at_rest, 0.0)
+    detector = SlipConsensus(nominal)
+    _, finding = detector.step(detector.initial_state(), at_rest, at_rest, 0.0)
+    FaultIsolation(nominal).update(at_rest, at_rest, finding, 0.001)
     measurement = ComputedTorqueMeasurement(at_rest, at_rest, np.zeros(3))
     ComputedTorque(nominal).step(computed_torque.initial_state(), measurement, TwistReference(np.zeros(3)), 1.0)
     limit_torque(TorqueLimits.of_robot(nominal), at_rest, at_rest, at_rest, 1.0)

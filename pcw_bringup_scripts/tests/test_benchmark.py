@@ -28,6 +28,9 @@ def test_one_run_prints_and_writes_every_figure(tmp_path, capsys):
     # The targets of the package set, each with a mark, whichever it is.
     assert set(targets) == {
         ("forward", "us", 20.0),
+        ("slip", "us", 15.0),
+        ("the", "us", 15.0),
+        ("slip", "us", 5.0),
         ("Lambda", "us", 5.0),
         ("slip", "us", 40.0),
         ("angle-only", "us", 40.0),

@@ -6,7 +6,7 @@
     eps_hat = p_dot - p_dot_hat = (I - A A^+) B q_dot                                       (4.4), (4.5)
 
 The projection spreads the slip of one wheel over all, and it is blind to slip that looks like a motion of the robot.
-Which wheels the others are right to mistrust, (4.6)-(4.8), is decided by a later step on this one's output.
+Which wheels the others are right to mistrust is decided by `slip_procedure`, (4.6)-(4.8), and better by `slip_consensus`.
 
 When is a wheel slipping? On a real robot with nominal geometry the residual grows with speed and steering rate without any
 slip. Logs of the DYROS PCV: up to 7 mm/s at standstill; above 0.1 m/s the worst wheel has a median of 5-6 % of the speed,
@@ -30,6 +30,7 @@ from pcw_description.differential_kinematics import forward_kinematics_kernel, w
 from pcw_description.robot_description import LONGITUDINAL, STEER, FloatArray, RobotDescription
 
 from .errors import EstimationError
+from .slip_verdict import SlipFinding, Verdict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,3 +158,32 @@ def _slip_ratio_and_angle(fitted: FloatArray, sensed: FloatArray, slip: FloatArr
     along = np.maximum(np.abs(fitted[:, LONGITUDINAL]), np.abs(sensed[:, LONGITUDINAL]))
     along = np.maximum(along, least_speed)
     return np.stack([slip[:, 0] / along, np.arctan2(slip[:, 1], along)], axis=1)
+
+
+class SlipProjection:
+    """The same with the interface of `SlipConsensus`: (4.4) with the threshold of three terms, and no wheel left out."""
+
+    def __init__(self, robot: RobotDescription, parameters: EncoderSlipParameters | None = None) -> None:
+        self.robot, self.parameters = robot, parameters or EncoderSlipParameters()
+
+    def initial_state(self) -> EncoderSlipState:
+        """Return the state before the first measurement."""
+        return initial_state(self.robot)
+
+    def step(
+        self, state: EncoderSlipState, joint_position: FloatArray, joint_velocity: FloatArray, dt: float
+    ) -> tuple[EncoderSlipState, SlipFinding]:
+        """See `step`; the covariance follows from the mean squared residual, as in (4.2) no wheel is left out."""
+        state, output = step(self.robot, self.parameters, state, joint_position, joint_velocity, dt)
+        jacobian = wheel_jacobian_kernel(
+            self.robot.steer_axis, self.robot.caster_offset, np.ascontiguousarray(joint_position[:, STEER])
+        )
+        freedom = 2 * self.robot.n - 3
+        covariance = float(np.sum(output.slip**2)) / freedom * np.linalg.inv(jacobian.T @ jacobian)
+        threshold = np.full(output.slip.shape, output.threshold)
+        flagged = output.slipping | output.skidding
+        verdict = Verdict.SLIP if flagged.any() else Verdict.CONSISTENT
+        return state, SlipFinding(
+            output.twist, covariance, output.slip, output.ratio, threshold, np.abs(output.slip) > threshold, output.slipping,
+            output.skidding, verdict,
+        )

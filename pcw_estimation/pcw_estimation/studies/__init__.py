@@ -1,1 +1,1 @@
-"""Studies that measure the estimators, and write what they find into the documentation."""
+"""Studies that measure the estimators: drawn robots and drives, and the figures of the documentation."""
