@@ -41,6 +41,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "import_columns = pcw_description.import_columns:main",
             "robot_description = pcw_description.nodes.robot_description:main",
             "transforms = pcw_description.nodes.transforms:main",
             "urdf = pcw_description.urdf:main",

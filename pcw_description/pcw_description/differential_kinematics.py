@@ -11,6 +11,12 @@ centre p = S + b_x u + b_y n,
 `b_y` enters B because the fork swings a wheel that stands beside the axis along its own heading as well. The slip uses
 the velocity of the chassis-fixed point at the wheel centre. A^T A depends on the wheel centres alone, so A^+ has a
 closed form and exists for any two distinct wheels (3.34).
+
+A robot with fixed wheels has the axle that they share besides, at p_a with the heading d, which nothing moves along:
+
+    n(d) . (v + omega z x p_a) = 0.
+
+It is one more row of the least squares, and with one caster whose wheel stands off the axle it makes them unique.
 """
 
 from __future__ import annotations
@@ -22,6 +28,8 @@ import numpy as np
 from .compiled import compiled
 from .errors import KinematicsError
 from .robot_description import MINIMUM_CASTER_OFFSET, FloatArray, RobotDescription
+
+DRAG_SPEED = 1e-9  # [m/s]; a twist that lets fixed wheels roll is exact but for rounding
 
 
 @compiled
@@ -88,13 +96,87 @@ def rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed):  # type
 
 
 @compiled
-def forward_kinematics_kernel(steer_axis, caster_offset, wheel_radius, steer_angle, joint_velocity):  # type: ignore[no-untyped-def]
-    """Return twist (3,), slip (n, 2) and (A^T A)^-1 (3, 3): the closed form of A^+ B q_dot."""
-    sensed = np.empty((len(steer_angle), 2))
-    for i in range(len(steer_angle)):
+def axle_row_kernel(axle):  # type: ignore[no-untyped-def]
+    """Return the velocity (3,) of an axle (x, y, heading) along itself per twist of base_link."""
+    c, s = math.cos(axle[2]), math.sin(axle[2])
+    return np.array([-s, c, c * axle[0] + s * axle[1]])
+
+
+@compiled
+def guided_motion_kernel(steer_axis, caster_offset, axle, steer_angle, sensed):  # type: ignore[no-untyped-def]
+    """As `rigid_motion_kernel`, of velocities (n + k, 2) of n casters and k fixed axles (k, 3), which have a lateral one.
+
+    A wheel that rolls lets nothing move along its axle: there the velocity is zero, or what slips along it.
+    """
+    n, k = len(steer_angle), len(axle)
+    if k == 0:
+        return rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed)
+    jacobian = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle)
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for row in range(2 * n):
+        for i in range(3):
+            right[i] += jacobian[row, i] * sensed[row // 2, row % 2]
+            for j in range(3):
+                normal[i, j] += jacobian[row, i] * jacobian[row, j]
+    for a in range(k):
+        across = axle_row_kernel(axle[a])
+        for i in range(3):
+            right[i] += across[i] * sensed[n + a, 1]
+            for j in range(3):
+                normal[i, j] += across[i] * across[j]
+    inverse = _inverse(normal)
+    twist = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            twist[i] += inverse[i, j] * right[j]
+    slip = np.zeros((n + k, 2))
+    for row in range(2 * n):
+        moved = jacobian[row, 0] * twist[0] + jacobian[row, 1] * twist[1] + jacobian[row, 2] * twist[2]
+        slip[row // 2, row % 2] = sensed[row // 2, row % 2] - moved
+    for a in range(k):
+        across = axle_row_kernel(axle[a])
+        slip[n + a, 1] = sensed[n + a, 1] - (across[0] * twist[0] + across[1] * twist[1] + across[2] * twist[2])
+    return twist, slip, inverse
+
+
+@compiled
+def _inverse(m):  # type: ignore[no-untyped-def]
+    """Return the inverse of a symmetric (3, 3)."""
+    inverse = np.empty((3, 3))
+    inverse[0, 0] = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+    inverse[0, 1] = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    inverse[0, 2] = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    inverse[1, 1] = m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
+    inverse[1, 2] = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
+    inverse[2, 2] = m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
+    inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
+    return inverse / (m[0, 0] * inverse[0, 0] + m[0, 1] * inverse[0, 1] + m[0, 2] * inverse[0, 2])
+
+
+@compiled
+def sensed_velocities_kernel(caster_offset, wheel_radius, joint_velocity):  # type: ignore[no-untyped-def]
+    """Return B q_dot (n, 2): what the joints say of the wheel centres."""
+    sensed = np.empty((len(wheel_radius), 2))
+    for i in range(len(wheel_radius)):
         sensed[i, 0] = wheel_radius[i] * joint_velocity[i, 0] + caster_offset[i, 1] * joint_velocity[i, 1]
         sensed[i, 1] = -caster_offset[i, 0] * joint_velocity[i, 1]
+    return sensed
+
+
+@compiled
+def forward_kinematics_kernel(steer_axis, caster_offset, wheel_radius, steer_angle, joint_velocity):  # type: ignore[no-untyped-def]
+    """Return twist (3,), slip (n, 2) and (A^T A)^-1 (3, 3): the closed form of A^+ B q_dot."""
+    sensed = sensed_velocities_kernel(caster_offset, wheel_radius, joint_velocity)
     return rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed)
+
+
+@compiled
+def guided_kinematics_kernel(steer_axis, caster_offset, wheel_radius, axle, steer_angle, joint_velocity):  # type: ignore[no-untyped-def]
+    """As `forward_kinematics_kernel`, with fixed axles (k, 3); the slip is (n + k, 2)."""
+    n = len(steer_angle)
+    sensed = np.zeros((n + len(axle), 2))
+    sensed[:n] = sensed_velocities_kernel(caster_offset, wheel_radius, joint_velocity)
+    return guided_motion_kernel(steer_axis, caster_offset, axle, steer_angle, sensed)
 
 
 def wheel_jacobian(robot: RobotDescription, steer_angle: FloatArray) -> FloatArray:
@@ -148,8 +230,8 @@ def forward_kinematics(
     Returns:
         Twist of base_link (v_x, v_y, omega) [m/s, m/s, rad/s].
     """
-    twist: FloatArray = forward_kinematics_kernel(
-        robot.steer_axis, robot.caster_offset, robot.wheel_radius, steer_angle, joint_velocity
+    twist: FloatArray = guided_kinematics_kernel(
+        robot.steer_axis, robot.caster_offset, robot.wheel_radius, robot.fixed_axle, steer_angle, joint_velocity
     )[0]
     return twist
 
@@ -166,8 +248,16 @@ def inverse_kinematics(robot: RobotDescription, steer_angle: FloatArray, twist: 
         Joint rates (n, 2) [rad/s].
 
     Raises:
-        KinematicsError: a caster without offset along its heading; its steering rate does not follow from the twist.
+        KinematicsError: a caster without offset along its heading; its steering rate does not follow from the twist. Or a
+            twist that drags fixed wheels along their axle.
     """
+    for axle in robot.fixed_axle:
+        dragged = float(axle_row_kernel(axle) @ np.asarray(twist, dtype=float))
+        if abs(dragged) > DRAG_SPEED:
+            raise KinematicsError(
+                f"{robot.name}: twist {np.asarray(twist).tolist()} drags the fixed wheels along their axle at {dragged:g} m/s"
+                f"; allowed: at most {DRAG_SPEED:g} m/s"
+            )
     bx, by = robot.caster_offset[:, 0], robot.caster_offset[:, 1]
     if np.any(np.abs(bx) < MINIMUM_CASTER_OFFSET):
         raise KinematicsError(

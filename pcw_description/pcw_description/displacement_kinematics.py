@@ -78,7 +78,11 @@ def forward_displacement(
 
     Returns:
         Displacement (x, y, theta) in base_link of the beginning [m, m, rad], and the closure residual (n, 2) [m].
+
+    Raises:
+        KinematicsError: a robot with fixed wheels.
     """
+    robot.require_casters_only("the displacement model")
     displacement, residual = forward_displacement_kernel(
         robot.steer_axis, robot.caster_offset, robot.wheel_radius, steer_angle, joint_displacement
     )
@@ -99,8 +103,10 @@ def inverse_displacement(
         Joint displacements (n, 2) [rad]; the steering part lies in (-pi, pi].
 
     Raises:
-        KinematicsError: a caster without offset, or a displacement that no roll of the wheel along its heading reaches.
+        KinematicsError: a caster without offset, a displacement that no roll of the wheel along its
+            heading reaches, or a robot with fixed wheels.
     """
+    robot.require_casters_only("the displacement model")
     offset = robot.caster_offset
     if np.any(np.abs(offset[:, 0]) < MINIMUM_CASTER_OFFSET):
         raise KinematicsError(

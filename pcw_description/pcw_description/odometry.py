@@ -11,7 +11,8 @@ the mean of e^2 is twice the variance of the measurement. With N = (A^T A)^-1, t
 
     pose covariance = sum q N  +  var(w) (N at the start + N now).
 
-Only slip on which the wheels disagree is seen; a scale error common to all wheels is not.
+Only slip on which the wheels disagree is seen; a scale error common to all wheels is not. One steered wheel and one fixed
+axle cannot disagree: the covariance is then that of the encoders' counts alone, and no slip is in it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import math
 import numpy as np
 
 from .compiled import compiled
-from .differential_kinematics import forward_kinematics_kernel
+from .differential_kinematics import forward_kinematics_kernel, guided_kinematics_kernel
 from .displacement_kinematics import forward_displacement_kernel
 from .errors import KinematicsError
 from .robot_description import STEER, FloatArray, RobotDescription
@@ -164,6 +165,27 @@ def _differential_update(steer_axis, caster_offset, wheel_radius, before, after,
 
 
 @compiled
+def _guided_update(  # type: ignore[no-untyped-def]
+    steer_axis, caster_offset, wheel_radius, axle, before, after, pose, residual_memory, drift_memory, noise, least_variance
+):
+    """One update by (3.33) of a robot with fixed axles (k, 3).
+
+    Where nothing is redundant, `least_variance` stands for that of a wheel-centre component [m^2].
+    """
+    step = after - before
+    increment, residual, normal_inverse = guided_kinematics_kernel(
+        steer_axis, caster_offset, wheel_radius, axle, before[:, STEER] + 0.5 * step[:, STEER], step
+    )
+    if 2 * len(step) + len(axle) <= 3:
+        noise = noise.copy()
+        noise[RESIDUAL_VARIANCE] = 2.0 * least_variance
+    increment, covariance, residual, moved, pose_covariance, noise = _finish_update(
+        increment, residual, normal_inverse, step, pose, residual_memory, drift_memory, noise
+    )
+    return increment, covariance, residual[: len(step)].copy(), moved, pose_covariance, noise
+
+
+@compiled
 def _displacement_one_way(steer_axis, caster_offset, wheel_radius, steer_angle, step):  # type: ignore[no-untyped-def]
     """Return the body increment (3,) of (3.31) and its residual in the wheel frames; the logarithm of the displacement."""
     end, residual = forward_displacement_kernel(steer_axis, caster_offset, wheel_radius, steer_angle, step)
@@ -214,7 +236,7 @@ def _finish_update(increment, residual, normal_inverse, step, pose, residual_mem
         any_moved = any_moved or step[i, 0] != 0.0 or step[i, 1] != 0.0
     # A sample in which no joint moved tells nothing about noise.
     if any_moved:
-        _learn_noise(residual, now, dx, dy, residual_memory, drift_memory, noise)
+        _learn_noise(residual, len(step), now, dx, dy, residual_memory, drift_memory, noise)
     slip_covariance = noise[SLIP_COVARIANCE : SLIP_COVARIANCE + 9].reshape((3, 3))
     if noise[UPDATES] < WARM_UP:
         covariance = noise[RESIDUAL_VARIANCE] * slip_covariance  # the careful assumption: all of it is slip
@@ -226,8 +248,11 @@ def _finish_update(increment, residual, normal_inverse, step, pose, residual_mem
 
 
 @compiled
-def _learn_noise(residual, now, dx, dy, residual_memory, drift_memory, noise):  # type: ignore[no-untyped-def]
-    """Advance the state of the noise in place by one update that moved base_link by (dx, dy) in odom."""
+def _learn_noise(residual, casters, now, dx, dy, residual_memory, drift_memory, noise):  # type: ignore[no-untyped-def]
+    """Advance the state of the noise in place by one update that moved base_link by (dx, dy) in odom.
+
+    residual: of the casters, then of fixed axles, each of which has a lateral part alone.
+    """
     n = len(residual)
     noise[UPDATES] += 1.0
     updates = noise[UPDATES]
@@ -248,12 +273,14 @@ def _learn_noise(residual, now, dx, dy, residual_memory, drift_memory, noise):  
             once[2 * i + j] = keep * level
             squared += residual[i, j] * residual[i, j]
             squared_twice += twice[2 * i + j] * twice[2 * i + j]
-    # 2n measured velocities, 3 estimated: the rest of the freedom tells the noise.
-    freedom = 2 * n - 3
-    fresh = squared_twice / (freedom * noise[TWICE]) if updates > 1.0 else 0.0
-    weight = max(1.0 / updates, 1.0 / residual_memory)
-    noise[RESIDUAL_VARIANCE] += weight * (squared / freedom - noise[RESIDUAL_VARIANCE])
-    noise[SLIP_VARIANCE] += weight * (fresh - noise[SLIP_VARIANCE])
+    # 2 velocities of every caster, one of every axle, 3 estimated: the rest of the freedom tells the noise.
+    freedom = n + casters - 3
+    fresh = 0.0
+    if freedom > 0:
+        fresh = squared_twice / (freedom * noise[TWICE]) if updates > 1.0 else 0.0
+        weight = max(1.0 / updates, 1.0 / residual_memory)
+        noise[RESIDUAL_VARIANCE] += weight * (squared / freedom - noise[RESIDUAL_VARIANCE])
+        noise[SLIP_VARIANCE] += weight * (fresh - noise[SLIP_VARIANCE])
     slip_covariance = noise[SLIP_COVARIANCE : SLIP_COVARIANCE + 9].reshape((3, 3))
     start_covariance = noise[START_COVARIANCE : START_COVARIANCE + 9].reshape((3, 3))
     grown = _carried(slip_covariance, dx, dy)
@@ -290,7 +317,8 @@ def update(
         New state and output. The first measurement only stores the angles and gives a zero twist.
 
     Raises:
-        KinematicsError: dt is not positive, or the angles are not finite or not of shape (n, 2); the caller keeps its state.
+        KinematicsError: dt is not positive, the angles are not finite or not of shape (n, 2), or the displacement method is
+            asked for with fixed wheels; the caller keeps its state.
     """
     # One memory layout: another one would compile the kernels anew in the middle of a run.
     joint_position = np.array(joint_position, dtype=np.float64, order="C")
@@ -302,18 +330,33 @@ def update(
         raise KinematicsError("joint_position holds NaN or infinity; allowed: finite angles in rad")
     if state.joint_position is None:
         origin = (state.pose, state.pose_covariance) if state.pose_covariance.any() else None
-        noise = np.zeros(NOISE_SIZE + 4 * robot.n)
+        noise = np.zeros(NOISE_SIZE + 4 * (robot.n + len(robot.fixed_axle)))
         first = OdometryState(joint_position, state.pose, state.pose_covariance, noise, origin)
         return first, OdometryOutput(np.zeros(3), np.zeros((3, 3)), np.zeros((robot.n, 2)))
     if not 0.0 < dt < math.inf:
         raise KinematicsError(f"dt = {dt!r} s is not allowed; allowed: above 0 and finite, measured from stamps")
-    advance = _differential_update if parameters.method == "differential" else _displacement_update
-    increment, increment_covariance, residual, pose, covariance, noise = advance(
-        robot.steer_axis, robot.caster_offset, robot.wheel_radius, state.joint_position, joint_position, state.pose,
-        float(parameters.residual_memory), float(parameters.drift_memory), state.noise,
-    )
+    memories = float(parameters.residual_memory), float(parameters.drift_memory)
+    if robot.fixed_wheels:
+        if parameters.method != "differential":
+            robot.require_casters_only(f"odometry by the {parameters.method} model")
+        increment, increment_covariance, residual, pose, covariance, noise = _guided_update(
+            robot.steer_axis, robot.caster_offset, robot.wheel_radius, robot.fixed_axle, state.joint_position, joint_position,
+            state.pose, *memories, state.noise, _resolution(robot),
+        )
+    else:
+        advance = _differential_update if parameters.method == "differential" else _displacement_update
+        increment, increment_covariance, residual, pose, covariance, noise = advance(
+            robot.steer_axis, robot.caster_offset, robot.wheel_radius, state.joint_position, joint_position, state.pose,
+            *memories, state.noise,
+        )
     output = OdometryOutput(increment / dt, increment_covariance / dt**2, residual / dt)
     if state.origin is not None:
         start, start_covariance = state.origin
         covariance = covariance + _carried(start_covariance, pose[0] - start[0], pose[1] - start[1])
     return OdometryState(joint_position, pose, covariance, noise, state.origin), output
+
+
+def _resolution(robot: RobotDescription) -> float:
+    """Variance of the way that a wheel rolled, as its encoder's counts give it; the largest of all wheels [m^2]."""
+    counts = robot.sensors.encoders.drive_counts * np.abs([caster.gears.drive for caster in robot.casters])
+    return float(np.max((math.tau * robot.wheel_radius / np.maximum(counts, 1.0)) ** 2)) / 12.0

@@ -31,6 +31,8 @@ CONTACT_MODELS = ("kiencke", "magic_formula", "dugoff", "burckhardt", "lugre")
 MINIMUM_AXIS_DISTANCE = 0.01
 # Below this offset steering cannot push the wheel sideways with a usable torque.
 MINIMUM_CASTER_OFFSET = 1e-3
+# Fixed wheels whose axles lie so close to one line roll about one axle; further apart they drag in every curve.
+AXLE_DISTANCE, AXLE_ANGLE = 0.02, 0.02  # [m], [rad]
 # A wheel sinks in by so much under its share of the weight [m], with this damping ratio, where `suspension` says nothing else.
 STATIC_DEFLECTION = 1.5e-3
 SUSPENSION_DAMPING_RATIO = 0.4
@@ -183,6 +185,21 @@ class Caster:
 
 
 @dataclasses.dataclass(frozen=True)
+class FixedWheel:
+    """A passive wheel that does not steer: the axle of a tricycle. It has no joint and lets nothing move along its axle."""
+
+    name: str = text("name of the wheel")
+    position: tuple[float, float] = quantity(
+        "m", "wheel centre in base_link", length=2, minimum=-10.0, maximum=10.0, hint="a larger value may be in mm"
+    )
+    wheel_radius: float = quantity("m", "rolling radius", above=0.0, maximum=1.0, hint="a larger value may be in mm")
+    direction: float = quantity(
+        "rad", "heading in base_link; 0 = rolls towards +x", minimum=-math.pi, maximum=math.pi, default=0.0,
+        hint="a larger value may be in degrees",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class Encoders:
     """Encoders on the motors."""
 
@@ -210,6 +227,21 @@ class TrackerDescription:
     rate: float = quantity("Hz", "rate of ground_truth/odom", above=0.0, maximum=2e4)
     position_noise: float = quantity("m", "standard deviation of one sample", minimum=0.0, maximum=1.0, default=0.0)
     yaw_noise: float = quantity("rad", "standard deviation of one sample", minimum=0.0, maximum=1.0, default=0.0)
+    position: tuple[float, float] | None = quantity(
+        "m", "in base_link, of what is tracked; without it base_link itself is", length=2, minimum=-10.0, maximum=10.0,
+        hint="a larger value may be in mm", default=None,
+    )
+    yaw: float = quantity(
+        "rad", "of what is tracked, in base_link", minimum=-math.pi, maximum=math.pi, default=0.0,
+        hint="a larger value may be in degrees",
+    )
+
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Where what is tracked stands in base_link: x, y [m], yaw [rad]."""
+        x, y = self.position or (0.0, 0.0)
+        return x, y, self.yaw
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,12 +297,17 @@ DEFAULT_TOLERANCES: Mapping[str, Tolerance] = {
     "imu.gyro_bias": Tolerance(0.002, "rad/s", False),
     "imu.accelerometer_bias": Tolerance(0.05, "m/s^2", False),
     "imu.scale": Tolerance(0.005, "1", True),
+    # Of what is tracked, where the description says that it is not base_link itself.
+    "tracker.position": Tolerance(0.005, "m", False),
+    "tracker.yaw": Tolerance(0.005, "rad", False),
+    "fixed_wheels.position": Tolerance(0.002, "m", False),
+    "fixed_wheels.direction": Tolerance(0.002, "rad", False),
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class RobotDescription:
-    """A robot on n >= 2 powered casters, validated when it is made."""
+    """A robot on powered casters, validated when it is made: n >= 2, or n >= 1 and wheels that do not steer."""
 
     format: str = text("format of this file", choices=(FORMAT,))
     name: str = text("name of the robot")
@@ -279,6 +316,7 @@ class RobotDescription:
     casters: tuple[Caster, ...] = section("the casters, in the order used by every array")
     contact: ContactDescription = section("the nominal ground")
     sensors: Sensors = section("what the robot measures")
+    fixed_wheels: tuple[FixedWheel, ...] = section("passive wheels that do not steer, all on one axle", default=())
     suspension: Suspension | None = section(
         "what carries the load of one wheel; default: 1.5 mm of static deflection, damped with a ratio of 0.4", default=None
     )
@@ -289,9 +327,11 @@ class RobotDescription:
         """Check what no single field can see.
 
         Raises:
-            DescriptionError: fewer than two casters, a name twice, two casters on one axis, inertias that no body has.
+            DescriptionError: fewer than two casters and no fixed wheel, a name twice, two casters on one axis, fixed
+                wheels that drag or leave a motion undetermined, inertias that no body has.
         """
-        _check_casters(self.casters)
+        _check_casters(self.casters, least=1 if self.fixed_wheels else 2)
+        _check_fixed_wheels(self.fixed_wheels, self.casters)
         _check_chassis(self.chassis)
         for index, caster in enumerate(self.casters):
             _check_module(caster, f"casters[{index}]")
@@ -354,6 +394,20 @@ class RobotDescription:
         """Largest joint speeds, (n, 2) [rad/s]."""
         return _constant([[c.limits.drive_speed, c.limits.steer_speed] for c in self.casters])
 
+    @cached_property
+    def fixed_axle(self) -> FloatArray:
+        """The axle that all fixed wheels share, where its middle is and which way it rolls: x, y [m], heading [rad].
+
+        (1, 3), or (0, 3) for a robot without fixed wheels.
+        """
+        wheels = self.fixed_wheels
+        if not wheels:
+            return _constant(np.zeros((0, 3)))
+        first = wheels[0].direction
+        # Half a turn is the same axle.
+        heading = first + float(np.mean([math.remainder(wheel.direction - first, math.pi) for wheel in wheels]))
+        return _constant([[*np.mean([wheel.position for wheel in wheels], axis=0), heading]])
+
     @property
     def total_mass(self) -> float:
         """Mass of the whole robot [kg]."""
@@ -369,7 +423,7 @@ class RobotDescription:
         """What carries the load of one wheel, defaults filled in."""
         if self.suspension is not None:
             return self.suspension
-        share = self.total_mass / self.n
+        share = self.total_mass / (self.n + len(self.fixed_wheels))
         stiffness = share * GRAVITY / STATIC_DEFLECTION
         return Suspension(stiffness, 2.0 * SUSPENSION_DAMPING_RATIO * math.sqrt(stiffness * share))
 
@@ -403,11 +457,13 @@ class RobotDescription:
             raise DescriptionError("caster", name, nearest_name(name, self.caster_names)) from None
 
     def require_torque_control(self) -> None:
-        """Refuse robots whose steering cannot push the wheel sideways.
+        """Refuse robots whose steering cannot push the wheel sideways, and those that cannot move sideways.
 
         Raises:
-            KinematicsError: a caster has b_x of zero, so that B is singular and no steering torque makes a side force.
+            KinematicsError: a caster has b_x of zero, so that B is singular and no steering torque makes a side force; or
+                there are fixed wheels.
         """
+        self.require_casters_only("torque control and simulation")
         for caster in self.casters:
             if abs(caster.caster_offset[0]) < MINIMUM_CASTER_OFFSET:
                 raise KinematicsError(
@@ -418,15 +474,31 @@ class RobotDescription:
                 )
 
 
+    def require_casters_only(self, purpose: str) -> None:
+        """Refuse robots with fixed wheels, for what knows only wheels that turn.
+
+        Raises:
+            KinematicsError: there are fixed wheels.
+        """
+        if self.fixed_wheels:
+            names = ", ".join(wheel.name for wheel in self.fixed_wheels)
+            raise KinematicsError(
+                f"{self.name}: fixed_wheels are {names}; allowed for {purpose}: a robot on casters alone (a robot with fixed "
+                "wheels loads for kinematics, odometry and analysis)"
+            )
+
+
 def _constant(values: Any) -> FloatArray:
     array = np.asarray(values, dtype=float)
     array.setflags(write=False)
     return array
 
 
-def _check_casters(casters: Sequence[Caster]) -> None:
-    if len(casters) < 2:
-        raise DescriptionError("casters", len(casters), "allowed: at least 2 casters (thesis section 3.1)")
+def _check_casters(casters: Sequence[Caster], least: int) -> None:
+    if len(casters) < least:
+        raise DescriptionError(
+            "casters", len(casters), "allowed: at least 2 casters (thesis section 3.1), or 1 and fixed_wheels"
+        )
     names = [caster.name for caster in casters]
     for index, caster in enumerate(casters):
         where = f"casters[{index}]"
@@ -448,6 +520,46 @@ def _check_casters(casters: Sequence[Caster]) -> None:
         determinant = gears.drive * gears.steer - gears.drive_per_steer * gears.steer_per_drive
         if abs(determinant) < 1e-9:
             raise DescriptionError(f"{where}.gears", determinant, "allowed: a gear matrix that can be inverted")
+
+
+def _check_fixed_wheels(wheels: Sequence[FixedWheel], casters: Sequence[Caster]) -> None:
+    names = [caster.name for caster in casters]
+    for index, wheel in enumerate(wheels):
+        where, first = f"fixed_wheels[{index}]", wheels[0]
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", wheel.name):
+            raise DescriptionError(f"{where}.name", wheel.name, "allowed: letters, digits and _, beginning with a letter")
+        if wheel.name in names:
+            raise DescriptionError(f"{where}.name", wheel.name, "allowed: each name once, among the casters too")
+        names.append(wheel.name)
+        if abs(math.sin(wheel.direction - first.direction)) > AXLE_ANGLE:
+            raise DescriptionError(
+                f"{where}.direction", wheel.direction,
+                f"{wheel.name!r} and {first.name!r} would drag one another in every motion; "
+                f"allowed: the direction of {first.name!r}, {first.direction:g} rad, or half a turn from it",
+            )
+        apart = _along(first, wheel.position)
+        if abs(apart) > AXLE_DISTANCE:
+            raise DescriptionError(
+                f"{where}.position", list(wheel.position),
+                f"{wheel.name!r} is {apart:+.3g} m ahead of the axle of {first.name!r} and would drag in every curve; "
+                f"allowed: at most {AXLE_DISTANCE:g} m, all fixed wheels on one axle",
+            )
+    if len(casters) == 1 and wheels:
+        caster = casters[0]
+        apart = _along(wheels[0], caster.steer_axis)
+        # Above the axle the wheels agree in every motion about the point where they all are: the yaw rate is anybody's.
+        if abs(apart) < 2.0 * MINIMUM_AXIS_DISTANCE + math.hypot(*caster.caster_offset):
+            raise DescriptionError(
+                "casters[0].steer_axis", list(caster.steer_axis),
+                f"{caster.name!r} is {abs(apart):.3g} m from the axle of the fixed wheels, and turning does not show; "
+                f"allowed: more than {2.0 * MINIMUM_AXIS_DISTANCE + math.hypot(*caster.caster_offset):.3g} m",
+            )
+
+
+def _along(wheel: FixedWheel, place: Sequence[float]) -> float:
+    """How far a place is ahead of a fixed wheel, along its heading [m]."""
+    c, s = math.cos(wheel.direction), math.sin(wheel.direction)
+    return c * (place[0] - wheel.position[0]) + s * (place[1] - wheel.position[1])
 
 
 def _check_chassis(chassis: Chassis) -> None:

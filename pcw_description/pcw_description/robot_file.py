@@ -15,7 +15,7 @@ from .contact.contact_model import tyre_parameters
 from .description_fields import load_yaml_mapping, read_section
 from .effects.registry import read_physics
 from .errors import DescriptionError, nearest_name
-from .robot_description import DEFAULT_TOLERANCES, FORMAT, Caster, RobotDescription, Tolerance
+from .robot_description import DEFAULT_TOLERANCES, FORMAT, Caster, FixedWheel, RobotDescription, Tolerance
 
 _TOLERANCE = re.compile(r"^\s*([0-9.eE+-]+)\s*(.*?)\s*$")
 
@@ -72,6 +72,14 @@ def parse_robot(data: Mapping[str, Any]) -> RobotDescription:
     content["casters"] = tuple(
         read_section(Caster, _merged(defaults, item, f"casters[{index}]"), f"casters[{index}]")
         for index, item in enumerate(casters)
+    )
+    fixed_wheels = content.get("fixed_wheels")
+    if fixed_wheels is None:
+        fixed_wheels = []
+    if not isinstance(fixed_wheels, list):
+        raise DescriptionError("fixed_wheels", fixed_wheels, "allowed: a list of wheels that do not steer")
+    content["fixed_wheels"] = tuple(
+        read_section(FixedWheel, item, f"fixed_wheels[{index}]") for index, item in enumerate(fixed_wheels)
     )
     content["provenance"] = _read_provenance(content.get("provenance"))
     tolerances, physics = content.get("tolerances"), content.get("physics")
@@ -161,6 +169,8 @@ def robot_to_mapping(robot: RobotDescription) -> dict[str, Any]:
         "contact": _plain(robot.contact),
         "sensors": _plain(robot.sensors),
     }
+    if robot.fixed_wheels:
+        data["fixed_wheels"] = [_plain(wheel) for wheel in robot.fixed_wheels]
     if robot.suspension is not None:
         data["suspension"] = _plain(robot.suspension)
     if robot.tolerances:

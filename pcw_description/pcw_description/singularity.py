@@ -56,7 +56,7 @@ def analyse(
         tolerance: singular values below this, relative to the largest possible one, count as zero.
 
     Raises:
-        KinematicsError: `actuated` has another shape.
+        KinematicsError: `actuated` has another shape, or the robot has fixed wheels.
     """
     rows = _actuated_rows(robot, steer_angle, actuated)
     if rows.size == 0:
@@ -96,6 +96,7 @@ def find_singular_configuration(
 
 def _actuated_rows(robot: RobotDescription, steer_angle: FloatArray, actuated: npt.NDArray[np.bool_]) -> FloatArray:
     """Return the actuated rows, lengths scaled by the robot's radius so that singular values are comparable."""
+    robot.require_casters_only("singularities of selective actuation")
     actuated = np.asarray(actuated, dtype=bool)
     if actuated.shape != (robot.n, 2):
         raise KinematicsError(f"actuated has the shape {actuated.shape}; allowed: ({robot.n}, 2), drive and steer per caster")

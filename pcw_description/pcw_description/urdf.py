@@ -108,6 +108,10 @@ def _add_base(root: ElementTree.Element, robot: RobotDescription) -> None:
     clearance = 2.0 * float(robot.wheel_radius.max())
     centre = (0.0, 0.0, max(chassis.com[2], clearance + 0.5 * chassis.size[2]))
     _visual(link, "chassis", centre, (0.0, 0.0, 0.0), "box", size=_text(*chassis.size))
+    for wheel in robot.fixed_wheels:  # passive and without a joint: they are part of the base
+        place = (*wheel.position, wheel.wheel_radius)
+        sizes = {"radius": _text(wheel.wheel_radius), "length": _text(0.3 * wheel.wheel_radius)}
+        _visual(link, "wheel", place, (math.pi / 2.0, 0.0, wheel.direction), "cylinder", **sizes)
     collision = ElementTree.SubElement(link, "collision")
     _origin(collision, centre)
     ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), "box", size=_text(*chassis.size))

@@ -51,8 +51,11 @@ def check(robots: Sequence[str]) -> int:
         try:
             robot.require_torque_control()
         except PcwError:
-            remark = "; for kinematics and analysis only (b_x = 0)"
-        print(f"{name}: OK ({robot.n} casters, {robot.total_mass:g} kg{remark})")
+            remark = f"; for kinematics and analysis only ({'fixed wheels' if robot.fixed_wheels else 'b_x = 0'})"
+        wheels = f"{robot.n} caster{'s' if robot.n > 1 else ''}"
+        if robot.fixed_wheels:
+            wheels += f", {len(robot.fixed_wheels)} fixed wheel{'s' if len(robot.fixed_wheels) > 1 else ''}"
+        print(f"{name}: OK ({wheels}, {robot.total_mass:g} kg{remark})")
     return exit_code
 
 

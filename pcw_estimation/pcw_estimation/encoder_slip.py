@@ -94,7 +94,12 @@ class EncoderSlipOutput:
 
 
 def initial_state(robot: RobotDescription) -> EncoderSlipState:
-    """Return the state before the first measurement."""
+    """Return the state before the first measurement.
+
+    Raises:
+        KinematicsError: the robot has fixed wheels, whose slip no encoder shows.
+    """
+    robot.require_casters_only("slip from encoders")
     return EncoderSlipState(np.zeros((robot.n, 2)))
 
 

@@ -156,7 +156,9 @@ class Imu:
 
 
 def read_tracker(tracker: TrackerDescription, truth: PlantState, rng: np.random.Generator) -> FloatArray:
-    """Return the pose (x, y, yaw) that a tracker measures (3,) [m, m, rad]."""
+    """Return the pose (x, y, yaw) that a tracker measures (3,) [m, m, rad], of what it tracks."""
     sigma = np.array([tracker.position_noise, tracker.position_noise, tracker.yaw_noise])
-    noisy: FloatArray = truth.pose + sigma * rng.standard_normal(3)
+    x, y, yaw = tracker.place
+    c, s = math.cos(truth.pose[2]), math.sin(truth.pose[2])
+    noisy: FloatArray = truth.pose + [c * x - s * y, s * x + c * y, yaw] + sigma * rng.standard_normal(3)
     return noisy

@@ -178,7 +178,8 @@ def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance
     parameters = {}
     for name, estimate in named.estimates.items():
         declared = effect.parameter(name)
-        if declared in effect.searched_parameters or declared.default is None or name in named.term.resolution:
+        searched = {*(p.name for p in effect.searched_parameters), *(p.name for p in named.term.parameters)}
+        if name in searched or declared.default is None or name in named.term.resolution:
             parameters[name] = ParameterFinding(estimate.value, subject.unit(declared.unit), estimate.low, estimate.high)
     return EffectFinding(
         name=named.term.effect,
@@ -223,9 +224,11 @@ def _retuned(problem: RegressionProblem, fit: Fit) -> tuple[RetunedFinding, ...]
     """Numbers of the description that the recordings move, or determine better than its tolerance states them."""
     found = []
     deviations = np.sqrt(np.diag(fit.covariance)[: len(problem.nuisances)] * max(fit.scale, 1e-12))
-    for nuisance, change, deviation in zip(problem.nuisances, fit.mean, deviations, strict=False):
+    # A red residual makes its own intervals narrow, and those of tolerances that it says nothing about.
+    known = deviations * max(1.0, 1.0 / math.sqrt(max(fit.scale, 1e-12)))
+    for nuisance, change, deviation, least in zip(problem.nuisances, fit.mean, deviations, known, strict=False):
         moved = abs(change) > max(RETUNED_SIGNIFICANCE * deviation, 0.1 * nuisance.deviation)
-        if moved or deviation < DETERMINED_PART * nuisance.deviation:
+        if moved or least < DETERMINED_PART * nuisance.deviation:
             value = nuisance.nominal + float(change)
             # Masses are weighed against the torques: no better than these are known.
             scale = problem.scale_deviation * value if nuisance.unit.startswith("kg") else 0.0

@@ -149,6 +149,7 @@ class LiveChannels:
     def __init__(
         self, robot: RobotDescription, parameters: LiveParameters | None = None, tuning: Tuning | None = None
     ) -> None:
+        robot.require_casters_only("watching it live")
         self.robot = robot
         self.parameters = parameters or LiveParameters()
         self.tuning = tuning

@@ -28,6 +28,7 @@ IntArray = npt.NDArray[np.int64]
 CURVED_FROM = 0.01
 # The power of its size that an effect is in proportion to is taken from this part of it to all of it, within these.
 WEAKER, POWERS = 0.8, (0.5, 3.0)
+PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
 Shape = Mapping[str, float]  # values of the shaping parameters of one candidate
 
@@ -343,7 +344,7 @@ class RegressionProblem:
     def _secants(
         self, changes: Mapping[str, float], sizes: Sequence[SizedTerm], index: int, residual: FloatArray
     ) -> tuple[FloatArray, dict[int, float]]:
-        """Columns (T, C, P) of one effect from none of it to its size, where that tells more than its derivative.
+        """Columns (T, C, P) of one effect from none of it to its size, where that tells more than its derivative there.
 
         With them the powers of the parameters that what the effect does is in proportion to there.
         """
@@ -371,6 +372,9 @@ class RegressionProblem:
             work = without - residual
             columns[:, :, k] = work / coefficient
             ratio = float(np.sum(work * (without - weaker))) / max(float(np.sum(work**2)), 1e-300)
+            if abs(ratio - WEAKER) < PROPORTIONAL * WEAKER:
+                # So the number of the description that does the same work keeps the same column, and each its own share of it.
+                columns[:, :, k] = (weaker - residual) / ((1.0 - WEAKER) * coefficient)
             if ratio > 0.0:
                 powers[k] = float(np.clip(math.log(ratio) / math.log(WEAKER), *POWERS))
         return columns, powers

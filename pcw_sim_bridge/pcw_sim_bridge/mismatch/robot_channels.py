@@ -26,7 +26,7 @@ from .first_look import Looked, remainder
 from .found_effect import effect_instance
 from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, SizedTerm, Term
 from .robot_effects import ChannelModel, true_motion, with_pose
-from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, read_motions
+from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, has_balance, read_motions
 from .robot_nuisances import (
     FLOOR,
     MODEL_DEVIATION,
@@ -36,13 +36,15 @@ from .robot_nuisances import (
     varied_numbers,
 )
 from .robot_terms import robot_terms
-from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, twists
+from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, at_place, twists
 from .signal_filter import SignalFilter
+from .sudden_slip import sudden_slip
 
 # Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
 SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
+SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
@@ -64,10 +66,7 @@ class RobotProblemBuilder:
             MismatchError: no piece is long enough.
         """
         self.robot = robot
-        with_torque = all(
-            r.joint_states.effort is not None and np.isfinite(r.joint_states.effort).any() for r in recordings
-        )
-        balanced = with_torque and bool(np.all(np.abs(robot.caster_offset[:, 0]) > 1e-3))
+        balanced = has_balance(robot, recordings)
         self.cutoff = cutoff if cutoff is not None else choose_cutoff(robot, recordings)
         motions: list[RobotMotion] = []
         for index, recording in enumerate(recordings):
@@ -76,7 +75,7 @@ class RobotProblemBuilder:
             raise MismatchError(f"no contiguous piece of at least {SHORTEST_SEGMENT:g} s in the recordings")
         imu = any(np.isfinite(motion.imu).any() for motion in motions)
         pose = any(np.isfinite(motion.tracked_twist).any() for motion in motions)
-        self.layout = ChannelLayout(robot.caster_names, balanced, imu, pose)
+        self.layout = ChannelLayout(robot.caster_names, balanced, imu, pose, len(robot.fixed_axle))
         # Numbers that effects in the description already change belong to the nominal model.
         described = as_it_really_is(robot)
         self.numbers = ModelNumbers.of(described)
@@ -210,6 +209,8 @@ class RobotProblemBuilder:
     def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
         """What the model misjudges in each sample (T, C): slips, by a part of the slips there are."""
         slips = differences.predicted[:, self.layout.consistency]
+        if not slips.size:
+            return np.zeros_like(differences.predicted)
         size = np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
         found = np.zeros_like(differences.predicted)
         found[:, self.layout.consistency] = SLIP_DEVIATION * size
@@ -224,7 +225,11 @@ class RobotProblemBuilder:
             twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
             slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
             speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * reach
-            bad = slip > SLIP_FLOOR + SLIP_FRACTION * speed
+            allowed = SLIP_FLOOR + SLIP_FRACTION * speed
+            bad = slip > allowed
+            if not self.layout.redundant:
+                rolled = at_place(twist, numbers.tracked)
+                bad = sudden_slip(motion.tracked_twist, rolled, motion.rate, reach, allowed)
             # What a filter makes of forces that no model follows reaches beyond the slip itself.
             reach_of_filter = round(RINGING * motion.rate / self.cutoff)
             bad = ndimage.binary_dilation(bad, iterations=max(reach_of_filter, 1))
@@ -253,12 +258,20 @@ class RobotProblemBuilder:
         return found
 
     def _variables(self, along: Mapping[str, Sequence[FloatArray]]) -> dict[str, FloatArray]:
-        """What a leftover may depend on, each (T,)."""
-        found = {}
-        for name, parts in along.items():
-            pieces = zip(self.filters, parts, strict=True)
-            found[name] = np.concatenate([f.decimate(p) if name == "time" else f.apply(p) for f, p in pieces])
-        return found
+        """What a leftover may depend on, each (T,).
+
+        Without forces the residual is what wheels say of the motion, and holds the noise of their speeds: a variable that
+        holds it too is smoothed.
+        """
+        smooth = self.filters if self.layout.balanced else [SignalFilter(f.rate, self.cutoff / SLOWER) for f in self.filters]
+
+        def variable(name: str, values: FloatArray, own: SignalFilter, slower: SignalFilter) -> FloatArray:
+            return own.decimate(values if name == "time" else slower.smooth(values))
+
+        return {
+            name: np.concatenate([variable(name, *piece) for piece in zip(parts, self.filters, smooth, strict=True)])
+            for name, parts in along.items()
+        }
 
     def _sites(self, differences: ChannelDifferences, along: Mapping[str, Sequence[FloatArray]]) -> Sites:
         """Where an unknown torque or force may act: every joint, and forces and a moment on the chassis."""

@@ -106,7 +106,8 @@ def normal_along(motion: RobotMotion, numbers: ModelNumbers, height: FloatArray 
     """Normal forces (T, n) [N] along a motion, over ground of a height (T, n) [m]."""
     angle = np.ascontiguousarray(motion.position[:, :, STEER])
     twist, _ = twists(numbers, angle, motion.velocity)
-    return normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)), height)
+    normal = normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)), height)
+    return np.ascontiguousarray(normal[:, : len(numbers.steer_axis)])
 
 
 def with_true_angles(

@@ -16,6 +16,8 @@ from .signal_filter import SignalFilter, derivative, uniform_segments, white_noi
 
 LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
 SMALLEST_CUTOFF = 3.0
+# Of a recording without a balance of forces: it has what is slow to tell, and below this no manoeuvre is seen.
+SMALLEST_KINEMATIC_CUTOFF = 0.5
 # Effects are evaluated on signals filtered this much wider than the channels, so that they see sharp reversals.
 PREFILTER_RATIO = 2.5
 # Rate of the motions that the model is evaluated on, per cut-off of the wide filter: derivatives stay exact to a percent.
@@ -23,7 +25,7 @@ MOTION_OVERSAMPLING = 4.0
 # The channels end at this part of the resonance of the robot on its tyres.
 TYRE_MARGIN = 0.5
 ALLOWED_DERIVATIVE_NOISE = 0.05
-LARGEST_GAP = 0.05  # [s]
+LARGEST_GAP, LARGEST_GAP_PERIODS = 0.05, 3.0  # [s], or so many periods of slow joint_states
 LARGEST_TRACKER_GAP = 0.25  # [s]; trackers are slower than joints
 SHORTEST_SEGMENT = 1.0  # [s]
 
@@ -39,7 +41,7 @@ class RobotMotion:
         quiet_torque: the torque without the noise of its measurement, where that can be had (T, n, 2).
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
-        tracked_twist: its velocity in base_link (T, 3); NaN where not recorded.
+        tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
     """
 
     recording: int
@@ -89,7 +91,8 @@ def read_motions(
     quiet = quiet_torque(robot, recording)
     quiet = torque if quiet is None else quiet
     signals = np.concatenate([signals, imu, _tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n)], axis=1)
-    rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
+    largest_gap = max(LARGEST_GAP, LARGEST_GAP_PERIODS * float(np.median(np.diff(joints.stamp))))
+    rate, pieces = uniform_segments(joints.stamp, signals, largest_gap)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
     step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
     for stamps, values in pieces:
@@ -121,7 +124,7 @@ def read_motions(
                     torque_rate=derivative(torque, rate)[keep].copy(),
                     quiet_torque=smooth[keep, 4 * n + 6 :].reshape(-1, n, 2),
                     imu=sensed[keep, :3],
-                    pose=pose[keep].copy(),
+                    pose=base_pose(robot, pose[keep]),
                     tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),
                 )
             )
@@ -143,6 +146,20 @@ def _tracked_pose(recording: Recording, stamps: FloatArray) -> FloatArray:
     for index in pauses:
         pose[(stamps > truth.stamp[index]) & (stamps < truth.stamp[index + 1])] = np.nan
     return pose
+
+
+def tracked_place(robot: RobotDescription) -> FloatArray:
+    """Where what is tracked stands in base_link: x, y [m], yaw [rad]; zeros where the description does not say."""
+    tracker = robot.sensors.tracker
+    return np.zeros(3) if tracker is None else np.array(tracker.place)
+
+
+def base_pose(robot: RobotDescription, pose: FloatArray) -> FloatArray:
+    """Pose (T, 3) of base_link by that of what is tracked."""
+    x, y, turned = tracked_place(robot)
+    yaw = pose[:, 2] - turned
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([pose[:, 0] - c * x + s * y, pose[:, 1] - s * x - c * y, yaw], axis=1)
 
 
 def _in_body(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
@@ -180,7 +197,13 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
             allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(acceleration)), 1e-3)
             if noise > 0.0:
                 cutoffs.append((allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)
-    return max(min(cutoffs), SMALLEST_CUTOFF)
+    return max(min(cutoffs), SMALLEST_CUTOFF if has_balance(robot, recordings) else SMALLEST_KINEMATIC_CUTOFF)
+
+
+def has_balance(robot: RobotDescription, recordings: Sequence[Recording]) -> bool:
+    """Whether forces can be balanced: torques were recorded, all casters have an offset, and no fixed wheel carries a part."""
+    with_torque = all(np.isfinite(recording.joint_states.effort).any() for recording in recordings)
+    return with_torque and not robot.fixed_wheels and bool(np.all(np.abs(robot.caster_offset[:, 0]) > 1e-3))
 
 
 def _runs(flags: BoolArray) -> list[tuple[int, int]]:

@@ -83,15 +83,21 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
     deviations = list(_geometry(robot))
     if layout.balanced:
         deviations += _dynamics(robot, differences.model.numbers)
+    deviations += _fixed_axle(robot)
     deviations += _tyres(robot)
     if layout.imu:
         deviations += _inertial_sensor()
+    if layout.pose:
+        deviations += _tracker(robot)
     for k, (sensor, there) in enumerate((("imu", layout.imu), ("tracker", layout.pose))):
         if there:
             deviations.append(("clock.offset", f"clock.offset.{sensor}", 0.0, _entry("clock", k)))
     for tolerance, label, nominal, vary in deviations:
         known = robot.tolerance(tolerance)
         deviation = known.value * abs(nominal) if known.relative else known.value
+        if label == "clock.offset.tracker" and not layout.balanced and tolerance not in robot.tolerances:
+            # How old a reading is that waits for its message: anything within a cycle of slow joint_states.
+            deviation = max(deviation, *(motion.sampling for motion in differences.motions))
         if deviation > 0.0:
             found.append(VariedNumber(label, known.unit, nominal, deviation, vary))
     return found
@@ -167,6 +173,28 @@ def _geometry(robot: RobotDescription) -> Iterator[Deviation]:
         for k, axis in enumerate("xy"):
             yield "caster_offset", f"caster_offset.{axis}/{caster.name}", 0.0, _entry("caster_offset", (i, k))
             yield "steer_axis", f"steer_axis.{axis}/{caster.name}", 0.0, _entry("steer_axis", (i, k))
+
+
+def _fixed_axle(robot: RobotDescription) -> Iterator[Deviation]:
+    """Where the axle of fixed wheels is along their heading, and which way they roll; along itself no axle is anywhere."""
+    for axle in robot.fixed_axle:
+        ahead = np.array([math.cos(axle[2]), math.sin(axle[2])])
+
+        def moved(numbers: ModelNumbers, step: float, ahead: FloatArray = ahead) -> None:
+            numbers.axle[0, :2] += step * ahead
+
+        yield "fixed_wheels.position", "fixed_wheels.position", 0.0, moved
+        yield "fixed_wheels.direction", "fixed_wheels.direction", 0.0, _entry("axle", (0, 2))
+
+
+def _tracker(robot: RobotDescription) -> Iterator[Deviation]:
+    """Where the tracked thing is mounted, if it is not base_link itself."""
+    tracker = robot.sensors.tracker
+    if tracker is None or tracker.position is None:
+        return
+    for k, axis in enumerate("xy"):
+        yield "tracker.position", f"tracker.position.{axis}", 0.0, _entry("tracked", k)
+    yield "tracker.yaw", "tracker.yaw", 0.0, _entry("tracked", 2)
 
 
 def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviation]:

@@ -29,7 +29,7 @@ from .errors import MismatchError
 from .findings import InputFinding
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .robot_channels import SLIP_FRACTION, STILL_SPEED, RobotProblemBuilder
-from .robot_motion import choose_cutoff
+from .robot_motion import base_pose, choose_cutoff
 from .robot_rollout import robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
@@ -151,7 +151,7 @@ class RobotSubject:
         recording: Recording = opened.recording
         for series in (recording.ground_truth, recording.odom):
             if series is not None and len(series.stamp) > 1:
-                return series.stamp, series.pose
+                return series.stamp, base_pose(self.robot, series.pose) if series is recording.ground_truth else series.pose
         return None
 
     def absent(self, opened: Sequence[Opened]) -> tuple[tuple[str, str], ...]:
@@ -173,7 +173,7 @@ class RobotSubject:
         """Return the windows to simulate; None without torques, or for a robot that cannot be driven by them."""
         recordings = [o.recording for o in opened]
         without_offset = bool(np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3))
-        if without_offset or not all(map(_has_effort, recordings)):
+        if without_offset or self.robot.fixed_wheels or not all(map(_has_effort, recordings)):
             return None
         return robot_windows(self.robot, recordings)
 

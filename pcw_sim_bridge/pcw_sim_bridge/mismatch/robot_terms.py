@@ -21,6 +21,7 @@ from pcw_description.effects.kinds import (
     ClockEffect,
     ContactEffect,
     DescriptionEffect,
+    EncoderEffect,
     JointTorqueEffect,
     TransmissionEffect,
 )
@@ -34,6 +35,7 @@ from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, wi
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
+HALF_A_TURN = math.pi  # [rad]
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 TURNING_ERROR = 0.01  # of columns at one direction that are put together from those at two others
 # What a leftover may depend on that an effect of a kind explains.
@@ -57,7 +59,8 @@ class _TermMaker:
 
     def terms(self) -> list[Term]:
         """All candidates."""
-        everything: list[tuple[str, ...]] = [*((name,) for name in self.robot.caster_names), self.robot.caster_names]
+        # Of one caster, each and all are the same.
+        everything = list(dict.fromkeys([*((name,) for name in self.robot.caster_names), self.robot.caster_names]))
         wanted: list[tuple[Effect, tuple[str, ...], str | None]] = []
         for effect in all_effects().values():
             if isinstance(effect, ActuatorEffect):
@@ -161,8 +164,13 @@ class _TermMaker:
 
     def _difference_term(self, effect: Effect, target: tuple[str, ...], axis: str | None) -> Term | None:
         """A candidate by differences of the whole channel model; None if no channel shows it."""
-        searched = effect.searched_parameters
-        if not searched or (isinstance(effect, ContactEffect) and not self.layout.balanced):
+        searched = self._searched(effect)
+        if not searched or (isinstance(effect, ContactEffect) and not (self.layout.balanced or self._rolls_unevenly(effect))):
+            return None
+        if not (self.layout.balanced or self.layout.imu) and target == ("chassis",):
+            return None  # loads and slopes would show as what tyres slip under forces that nobody measured
+        swings = isinstance(effect, EncoderEffect) and any(_is_direction(p) for p in effect.parameters if p not in searched)
+        if swings and not self._turns(target, axis or effect.axis):
             return None
         if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):
             return None
@@ -202,9 +210,16 @@ class _TermMaker:
             resolution=chosen.resolution,
             grid_size=chosen.among,
             turning=turning is not None,
-            noisy=isinstance(effect, TransmissionEffect),
+            # Where no torque was measured, tyres slip under the forces that the motion asks for, and its noise is in these.
+            noisy=isinstance(effect, TransmissionEffect) or (effect.name.startswith("tyre_") and not self.layout.balanced),
             once=look in ("windows", "patches"),
         )
+
+    def _searched(self, effect: Effect) -> tuple[EffectParameter, ...]:
+        """The parameters of an effect that are searched for; of clocks that of the tracker where no IMU has one."""
+        if isinstance(effect, ClockEffect) and self.layout.pose and not self.layout.imu:
+            return tuple(p for p in effect.parameters if effect.offset("ground_truth/odom", _only(effect, p)) != 0.0)
+        return effect.searched_parameters
 
     def _room(self, columns: FloatArray) -> FloatArray:
         """Coefficients (P,) with which columns (T, C, P) are as large as all that the description leaves in some channel."""
@@ -250,12 +265,24 @@ class _TermMaker:
     ) -> FloatArray:
         """Column (T, C) of one parameter of an effect, the others as in `at` or neutral."""
         step, value = _step(effect.parameter(name), neutral[name])
-        return self.differences.of_effect(EffectInstance(effect.name, target, {**at, **neutral, name: value}, axis)) / step
+        values = {p.name: 0.0 for p in effect.searched_parameters} | {**at, **neutral, name: value}
+        return self.differences.of_effect(EffectInstance(effect.name, target, values, axis)) / step
 
     def _has_rotors(self, target: Sequence[str], axis: str) -> bool:
         """Whether there are motors that a gear could let turn on their own."""
         casters = [self.robot.casters[self.robot.caster_index(name)] for name in target]
         return self.layout.balanced and all(getattr(caster.rotors, axis) > 0.0 for caster in casters)
+
+    def _rolls_unevenly(self, effect: ContactEffect) -> bool:
+        """Whether an effect on contacts shows in how wheels roll, whatever the forces: by where they are in their turn."""
+        searched = effect.searched_parameters
+        return any(_is_direction(p) for p in effect.parameters if p not in searched) and not _look_of(effect)
+
+    def _turns(self, target: Sequence[str], axis: str) -> bool:
+        """Whether joints turn far enough to tell what swings once per turn from a zero and a scale."""
+        joints = [(self.robot.caster_index(name), AXIS_NAMES.index(axis)) for name in target]
+        angles = np.concatenate([np.stack([m.position[:, i, k] for i, k in joints]) for m in self.differences.motions], axis=1)
+        return bool(np.ptp(angles, axis=1).min() > HALF_A_TURN)
 
     def _neutral(self, parameter: EffectParameter) -> float:
         """Value at which the parameter changes nothing."""
@@ -273,7 +300,7 @@ class _TermMaker:
     def _grid(self, effect: Effect) -> ChosenShapes | None:
         """Grid of the shaping parameters of an effect and its spacing; None where one can neither be searched nor left."""
         reach = np.max(np.abs(self.robot.steer_axis), axis=0)
-        searched = {p.name for p in effect.searched_parameters}
+        searched = {p.name for p in (*effect.searched_parameters, *self._searched(effect))}
         shapes: list[dict[str, float]] = [{}]
         resolution: dict[str, tuple[str, float]] = {}
         for parameter in effect.parameters:
@@ -364,6 +391,11 @@ def _spacing(parameter: EffectParameter, looked: Looked) -> tuple[str, float]:
     if parameter.unit == "1/rad":
         return "linear", math.pi / (2.0 * max(float(np.ptp(looked.angle.reshape(len(looked.angle), -1), axis=0).max()), 1.0))
     return "log", 2.15
+
+
+def _only(effect: Effect, parameter: EffectParameter) -> dict[str, float]:
+    """Parameters of an effect of which one alone is not zero."""
+    return {p.name: float(p is parameter) for p in effect.parameters}
 
 
 def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:

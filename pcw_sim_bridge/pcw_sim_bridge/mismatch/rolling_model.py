@@ -4,7 +4,7 @@
     rolling_consistency/<caster>_...       H[P B q_dot] - H[P eps]                         wheels against one another
     gyro                                   H[omega_imu] - H[omega]
     accelerometer/x|y                      H[a_imu] - H[acceleration at the sensor]
-    pose/x|y|yaw                           H[velocity of the tracked pose] - H[V]          in base_link
+    pose/x|y|yaw                           H[velocity of the tracked pose] - H[V there]    in the axes of what is tracked
 
 with H the same filter on both sides and P = 1 - A A^+. Each joint's own balance gives the force at its contact,
 
@@ -20,7 +20,9 @@ the whole, growing with frequency; the channels end well below the resonance of 
 were recorded, the forces are those that the motion asks of the wheels, shared as evenly as can be.
 
 Every number of the description that a healthy robot may differ in is a nuisance column, by differences of the whole
-model; so is every effect. Robots whose wheels have no offset along their heading (b_x = 0) have no torque balance here.
+model; so is every effect. Robots whose wheels have no offset along their heading (b_x = 0), or that have a fixed axle,
+have no torque balance here. A fixed axle is one more row of A, which senses nothing along itself; where the rows are then
+three, as on a tricycle, wheels cannot contradict each other and the tracked pose alone is compared.
 """
 
 from __future__ import annotations
@@ -39,13 +41,17 @@ from pcw_description.contact.contact_model import (
     slip_of_force,
     tyre_parameters,
 )
-from pcw_description.differential_kinematics import rigid_motion_kernel, wheel_jacobian_kernel
+from pcw_description.differential_kinematics import (
+    axle_row_kernel,
+    guided_motion_kernel,
+    wheel_jacobian_kernel,
+)
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
 from pcw_description.support_forces import support_forces
 
 from .chassis_sway import ChassisSway
 from .regression_problem import Channel, FloatArray
-from .robot_motion import RobotMotion
+from .robot_motion import RobotMotion, tracked_place
 from .signal_filter import derivative
 
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
@@ -60,18 +66,25 @@ class ChannelLayout:
         casters: names.
         balanced: motor torques and an offset along the heading: there is a balance of forces.
         imu: an inertial sensor; pose: a tracked pose.
+        axles: fixed axles, none or one.
     """
 
     casters: tuple[str, ...]
     balanced: bool
     imu: bool
     pose: bool
+    axles: int = 0
+
+    @property
+    def redundant(self) -> int:
+        """How many velocities of the wheels there are beyond the three that make the motion."""
+        return 2 * len(self.casters) + self.axles - 3
 
     @property
     def consistency(self) -> slice:
         """Columns of `rolling_consistency`, longitudinal and lateral by caster."""
         start = 3 if self.balanced else 0
-        return slice(start, start + 2 * len(self.casters))
+        return slice(start, start + (2 * len(self.casters) if self.redundant else 0))
 
     @property
     def inertial(self) -> slice:
@@ -89,8 +102,8 @@ class ChannelLayout:
         """The channels in order."""
         found = [Channel(name, "N m" if "torque" in name else "N") for name in WRENCH] if self.balanced else []
         # 2n slips of which a twist makes three: each sample tells so much less than its numbers.
-        share = (2.0 * len(self.casters) - 3.0) / (2.0 * len(self.casters))
-        for caster in self.casters:
+        share = self.redundant / (2.0 * len(self.casters))
+        for caster in self.casters if self.redundant else ():
             for axis, direction in (("drive", "longitudinal"), ("steer", "lateral")):
                 name = f"rolling_consistency/{caster}_{direction}"
                 found.append(Channel(name, "m/s", (caster,), axis, information=share))
@@ -174,7 +187,9 @@ class ModelNumbers:
         steer_zero: error of the measured headings (n,) [rad].
         gain: true over reported motor torque (n, 2).
         imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
-        tyres: numbers of the tyres (n, TYRE_SIZE); softness: slip at the contact per slip of these (n, 2).
+        axle: fixed axles (k, 3), k of 0 or 1: their middle [m] and heading [rad].
+        tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
+        tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
         heading_lead: how much later the headings were that belong to the rates beside them [s]. A simulation in steps that
             makes its rates from one set of angles, and the next angles from those rates, is half a step off.
@@ -199,6 +214,8 @@ class ModelNumbers:
     gyro_bias: float
     gyro_scale: float
     accelerometer_bias: FloatArray
+    axle: FloatArray
+    tracked: FloatArray
     tyres: FloatArray
     softness: FloatArray
     torque_lag: float
@@ -237,8 +254,10 @@ class ModelNumbers:
             gyro_bias=0.0,
             gyro_scale=1.0,
             accelerometer_bias=np.zeros(2),
-            tyres=np.array([tyre_parameters(tyre) for tyre in robot.tyres]),
-            softness=np.ones((robot.n, 2)),
+            axle=robot.fixed_axle.copy(),
+            tracked=tracked_place(robot),
+            tyres=np.array([tyre_parameters(tyre) for tyre in (*robot.tyres, *(robot.contact for _ in robot.fixed_axle))]),
+            softness=np.ones((robot.n + len(robot.fixed_axle), 2)),
             torque_lag=0.0,
             heading_lead=0.0,
             clock=np.zeros(2),
@@ -250,11 +269,11 @@ class ModelNumbers:
 
 
 @compiled
-def _rigid_motions(steer_axis, offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
+def _rigid_motions(steer_axis, offset, axle, steer_angle, sensed):  # type: ignore[no-untyped-def]
     twist = np.empty((len(sensed), 3))
     contradiction = np.empty_like(sensed)
     for t in range(len(sensed)):
-        twist[t], contradiction[t], _ = rigid_motion_kernel(steer_axis, offset[t], steer_angle[t], sensed[t])
+        twist[t], contradiction[t], _ = guided_motion_kernel(steer_axis, offset[t], axle, steer_angle[t], sensed[t])
     return twist, contradiction
 
 
@@ -263,14 +282,20 @@ def rigid_motions(
 ) -> tuple[FloatArray, FloatArray]:
     """Split velocities (T, n, 2) in the wheel frames into the twist A^+ w (T, 3) and what contradicts it (T, n, 2).
 
+    Those of fixed axles come last, (T, n + k, 2); where they are left out, nothing moves along them.
+
     Args:
         offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m]; None: the described ones.
     """
-    found: tuple[FloatArray, FloatArray] = _rigid_motions(
-        numbers.steer_axis, _offsets(numbers, steer_angle) if offset is None else offset,
+    n = len(numbers.steer_axis)
+    missing = n + len(numbers.axle) - velocity.shape[1]
+    if missing:
+        velocity = np.concatenate([velocity, np.zeros((len(velocity), missing, 2))], axis=1)
+    twist, contradiction = _rigid_motions(
+        numbers.steer_axis, _offsets(numbers, steer_angle) if offset is None else offset, numbers.axle,
         np.ascontiguousarray(steer_angle), velocity,
     )  # fmt: skip
-    return found
+    return twist, np.ascontiguousarray(contradiction[:, :n])
 
 
 def _offsets(numbers: ModelNumbers, steer_angle: FloatArray, tilt: FloatArray | None = None) -> FloatArray:
@@ -407,10 +432,13 @@ def mass_centre(numbers: ModelNumbers, steer_angle: FloatArray) -> FloatArray:
 
 
 @compiled
-def _normal_forces(mass, com, height_of_mass, spring, steer_axis, caster_offset, steer_angle, acceleration, height):  # type: ignore[no-untyped-def]
-    """Quasi-static normal forces (T, n) [N] from centre of mass and accelerations (T, 2), on ground of a height (T, n)."""
-    normal = np.empty_like(steer_angle)
-    centre = np.empty_like(steer_axis)
+def _normal_forces(  # type: ignore[no-untyped-def]
+    mass, com, height_of_mass, spring, steer_axis, caster_offset, axle, steer_angle, acceleration, height
+):
+    """Quasi-static normal forces (T, n + k) [N] from centre of mass and accelerations (T, 2), over a height (T, n + k)."""
+    normal = np.empty_like(height)
+    centre = np.empty((height.shape[1], 2))
+    centre[len(steer_axis) :] = axle[:, :2]
     for t in range(len(steer_angle)):
         for i in range(steer_angle.shape[1]):
             c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
@@ -425,30 +453,36 @@ def _normal_forces(mass, com, height_of_mass, spring, steer_axis, caster_offset,
 def normal_forces(
     numbers: ModelNumbers, steer_angle: FloatArray, acceleration: FloatArray, height: FloatArray | None = None
 ) -> FloatArray:
-    """Quasi-static normal forces (T, n) [N] on the wheels.
+    """Quasi-static normal forces (T, n + k) [N] on the wheels, then on fixed axles.
 
     Args:
         acceleration: of base_link in its own axes (T, 2 or more).
         height: of the ground under each wheel (T, n) [m]; None where it is level.
     """
     # On level ground the load does not depend on how stiff equal springs are, and rigid ones know no other.
-    height = np.zeros(steer_angle.shape) if height is None or numbers.spring == 0.0 else height
+    ground = np.zeros((len(steer_angle), steer_angle.shape[1] + len(numbers.axle)))
+    if height is not None and numbers.spring > 0.0:
+        ground[:, : height.shape[1]] = height
     forces: FloatArray = _normal_forces(
         numbers.total_mass, mass_centre(numbers, steer_angle), numbers.height_of_mass, numbers.spring or 1.0,
-        numbers.steer_axis, numbers.caster_offset, steer_angle, acceleration, height,
+        numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, acceleration, ground,
     )  # fmt: skip
     return forces
 
 
 @compiled
-def _shared_forces(steer_axis, caster_offset, steer_angle, wrench):  # type: ignore[no-untyped-def]
-    """Smallest contact forces (T, n, 2) in the wheel frames that make a wrench (T, 3): A (A^T A)^-1 w."""
-    force = np.zeros((len(wrench), len(steer_axis), 2))
+def _shared_forces(steer_axis, caster_offset, axle, steer_angle, wrench):  # type: ignore[no-untyped-def]
+    """Smallest contact forces (T, n + k, 2) in the wheel frames that make a wrench (T, 3): A (A^T A)^-1 w."""
+    n = len(steer_axis)
+    force = np.zeros((len(wrench), n + len(axle), 2))
     for t in range(len(wrench)):
-        _, _, normal_inverse = rigid_motion_kernel(steer_axis, caster_offset, steer_angle[t], force[t])
-        flat = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle[t]) @ (normal_inverse @ wrench[t])
-        for i in range(len(steer_axis)):
+        _, _, normal_inverse = guided_motion_kernel(steer_axis, caster_offset, axle, steer_angle[t], force[t])
+        per_length = normal_inverse @ wrench[t]
+        flat = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle[t]) @ per_length
+        for i in range(n):
             force[t, i, 0], force[t, i, 1] = flat[2 * i], flat[2 * i + 1]
+        for a in range(len(axle)):
+            force[t, n + a, 1] = axle_row_kernel(axle[a]) @ per_length
     return force
 
 
@@ -494,6 +528,15 @@ def slips(
     ratio = ratio - DAMPING_TIME * derivative(ratio, rate)
     result: FloatArray = speed[:, :, None] * ratio + numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
     return result
+
+
+def _axle_speeds(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
+    """Rolling speeds (T, k) of fixed axles in a motion (T, 3)."""
+    x, y, heading = numbers.axle.T
+    along = twist[:, :1] - twist[:, 2:] * y
+    across = twist[:, 1:2] + twist[:, 2:] * x
+    speeds: FloatArray = np.abs(np.cos(heading) * along + np.sin(heading) * across)
+    return speeds
 
 
 def inertial_wrench(
@@ -543,9 +586,9 @@ class RollingState:
         offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m].
         velocity: joint rates that wheels of the described radius would have (T, n, 2).
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
-        grip, speed: load times friction factor [N] and rolling speed [m/s] (T, n).
+        grip, speed: load times friction factor [N] and rolling speed [m/s] (T, n + k), fixed axles last.
         spin: torque of the ground on each wheel about the vertical (T, n) [N m].
-        force: contact forces in the wheel frames (T, n, 2) [N].
+        force: contact forces in the wheel frames (T, n + k, 2) [N].
     """
 
     steer_angle: FloatArray
@@ -585,11 +628,14 @@ def rolling_state(
         twist, contradiction = twists(numbers, steer_angle, velocity, offset)
         twist_dot = derivative(twist, motion.rate)
     felt = _without(twist_dot, pull)
+    n = len(numbers.steer_axis)
     normal = normal_forces(numbers, steer_angle, acceleration_of(twist, felt), around.height)
-    grip = np.maximum(normal if around.grip is None else normal * around.grip, 1.0)
-    speed = np.abs(velocity[:, :, DRIVE] * numbers.radius)
-    patches = numbers.tyres.copy()
-    patches[:, LAMBDA] *= numbers.softness[:, 0]  # the edge of a patch slips as the tyre does
+    grip = np.maximum(normal, 1.0)
+    if around.grip is not None:
+        grip[:, :n] = np.maximum(normal[:, :n] * around.grip, 1.0)
+    speed = np.concatenate([np.abs(velocity[:, :, DRIVE] * numbers.radius), _axle_speeds(numbers, twist)], axis=1)
+    patches = numbers.tyres[:n].copy()
+    patches[:, LAMBDA] *= numbers.softness[:n, 0]  # the edge of a patch slips as the tyre does
     spin = _scrub(patches, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
     if layout.balanced:
         torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
@@ -601,7 +647,7 @@ def rolling_state(
         )  # fmt: skip
     else:
         wrench = inertial_wrench(numbers, motion, steer_angle, twist, felt)
-        force = _shared_forces(numbers.steer_axis, numbers.caster_offset, steer_angle, wrench)
+        force = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, wrench)
     return RollingState(steer_angle, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force)
 
 
@@ -610,6 +656,14 @@ def _without(twist_dot: FloatArray, pull: FloatArray) -> FloatArray:
     felt = twist_dot.copy()
     felt[:, :2] -= pull
     return felt
+
+
+def at_place(twist: FloatArray, place: FloatArray) -> FloatArray:
+    """Twist (T, 3) of what stands at a place (x, y, yaw) in base_link, in its own axes."""
+    x, y, yaw = place
+    along, across = twist[:, 0] - twist[:, 2] * y, twist[:, 1] + twist[:, 2] * x
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([c * along + s * across, c * across - s * along, twist[:, 2]], axis=1)
 
 
 def channel_sides(
@@ -638,8 +692,9 @@ def channel_sides(
         if leaning is not None:
             wrench[:, :2] -= numbers.total_mass * derivative(derivative(leaning, motion.rate), motion.rate)
         predicted.append(wrench)
-    measured.append(state.contradiction.reshape(len(twist), -1))
-    predicted.append(slip_contradiction.reshape(len(twist), -1))
+    if layout.redundant:
+        measured.append(state.contradiction.reshape(len(twist), -1))
+        predicted.append(slip_contradiction.reshape(len(twist), -1))
     if layout.imu:
         x, y = numbers.imu_position
         omega, alpha = twist[:, 2], twist_dot[:, 2]
@@ -656,7 +711,7 @@ def channel_sides(
     if layout.pose:
         late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0
         measured.append(motion.tracked_twist + late)
-        predicted.append(twist)
+        predicted.append(at_place(twist, numbers.tracked))
     return np.concatenate(measured, axis=1), np.concatenate(predicted, axis=1)
 
 

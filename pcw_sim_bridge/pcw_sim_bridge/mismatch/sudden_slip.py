@@ -1,0 +1,35 @@
+"""Moments at which wheels and tracker part suddenly: where no other wheel says that one slips, or that a counter jumped.
+
+A wrong number of the description parts them slowly, as the robot turns and changes its speed. What comes within a moment
+and is gone again is no number: a wheel spun, a counter lost its place, the tracker saw something else.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from .regression_problem import BoolArray, FloatArray
+
+USUAL_DURATION = 3.0  # [s]; what stays for half of it is the usual difference
+SUDDEN = 6.0  # times what the difference usually departs from that, as the standard deviation of its quiet part
+MEDIAN_OF_NORMAL = 0.6745  # of the absolute value of a standard normal number
+
+
+def sudden_slip(tracked: FloatArray, rolled: FloatArray, rate: float, reach: float, least: FloatArray) -> BoolArray:
+    """Samples (T,) at which the tracked twist departs from that of the wheels more than it usually does.
+
+    Args:
+        tracked, rolled: twists (T, 3); NaN in `tracked` where nothing was tracked.
+        rate: of the samples [Hz].
+        reach: length that a yaw rate is multiplied by [m].
+        least: departure (T,) below which nothing is sudden [m/s].
+    """
+    known: BoolArray = np.asarray(np.isfinite(tracked).all(axis=1))
+    apart = np.where(known[:, None], tracked - rolled, 0.0)
+    window = min(round(USUAL_DURATION * rate) | 1, len(apart) | 1)
+    departure = apart - ndimage.median_filter(apart, size=(window, 1), mode="nearest")
+    size = np.hypot(departure[:, 0], departure[:, 1]) + reach * np.abs(departure[:, 2])
+    usual = float(np.median(size[known])) / MEDIAN_OF_NORMAL if known.any() else 0.0
+    found: BoolArray = known & (size > np.maximum(least, SUDDEN * usual))
+    return found
