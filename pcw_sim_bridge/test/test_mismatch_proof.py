@@ -11,6 +11,7 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
+from pcw_description.robot_description import thinnest_module_inertia
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.all_cores import on_all_cores
 from pcw_sim_bridge.mismatch.explanation import NamedTerm
@@ -172,6 +173,15 @@ def problem_of(variables: dict[str, np.ndarray], rate: float) -> RegressionProbl
     return RegressionProblem(
         (Channel("gyro", "rad/s"),), np.arange(count) / rate, once, once, rate, zero, zero, zero == 0.0, (), (), variables
     )
+
+
+def test_retuned_inertias_stay_those_that_matter_can_have() -> None:
+    """Where they hardly show, a fit may leave what is possible: the whole analysis ended with the error of the description."""
+    [first, *_] = THESIS.casters
+    robot = retuned_robot(THESIS, {"module.inertia_zz": 0.2 * first.module.inertia_zz, "wheel.inertia_axle": 1.0})
+    [first, *_] = robot.casters
+    assert first.module.inertia_zz > thinnest_module_inertia(first)
+    assert first.wheel.inertia_axle == pytest.approx(first.wheel.mass * first.wheel_radius**2)
 
 
 def test_manoeuvres_change_where_the_motion_does() -> None:

@@ -20,6 +20,7 @@ from pcw_description.robot_description import (
     Caster,
     ContactDescription,
     RobotDescription,
+    thinnest_module_inertia,
 )
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
@@ -255,7 +256,7 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
             x, y = (retuned.get(f"{key}.{axis}/{old.name}", 0.0) for axis in "xy")
             return place[0] + x, place[1] + y
 
-        return dataclasses.replace(
+        new = dataclasses.replace(
             old,
             caster_offset=moved("caster_offset", old.caster_offset),
             steer_axis=moved("steer_axis", old.steer_axis),
@@ -272,6 +273,7 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
                 steer=old.rotors.steer * scale["rotors.steer"],
             ),
         )
+        return _possible(new)
 
     robot = dataclasses.replace(robot, chassis=chassis, casters=tuple(caster(old) for old in robot.casters))
     return _with_tyres(robot, retuned)
@@ -297,6 +299,18 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
     for name in robot.caster_names:
         robot = robot.with_tyres([name], functools.partial(tyre, name))
     return robot
+
+
+def _possible(caster: Caster) -> Caster:
+    """The caster with inertias that matter can have: where they hardly show in a recording, a fit may leave these bounds."""
+    wheel = dataclasses.replace(
+        caster.wheel, inertia_axle=min(caster.wheel.inertia_axle, caster.wheel.mass * caster.wheel_radius**2)
+    )
+    mass = max(caster.module.mass, (1.0 + LEAST_PART) * wheel.mass)
+    caster = dataclasses.replace(caster, wheel=wheel, module=dataclasses.replace(caster.module, mass=mass))
+    least = (1.0 + LEAST_PART) * thinnest_module_inertia(caster)
+    module = dataclasses.replace(caster.module, inertia_zz=max(caster.module.inertia_zz, least))
+    return dataclasses.replace(caster, module=module)
 
 
 def _positive(value: float, nominal: float) -> float:
