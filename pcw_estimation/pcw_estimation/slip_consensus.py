@@ -34,6 +34,7 @@ from pcw_description.robot_description import GRAVITY, STEER, FloatArray, RobotD
 from .normal_equations import full_inverse, is_determined, parts_of_rows, solve, sum_of, upper_inverse
 from .slip_noise import SlipNoise, sensed_kernel, variance_kernel
 from .slip_verdict import (
+    REFUSED,
     ConfirmParameters,
     SlipFinding,
     Verdict,
@@ -41,6 +42,7 @@ from .slip_verdict import (
     confirm_kernel,
     describe_kernel,
     finding_of,
+    finite_kernel,
 )
 
 # Part of the cost of one slipping component that a leap of the twist costs at most: with three casters one that slips must
@@ -93,6 +95,7 @@ class SlipConsensus:
             ]
         )
         self._geometry = np.column_stack([robot.steer_axis, robot.caster_offset, robot.wheel_radius])
+        self._shape = (robot.n, 2)
 
     def initial_state(self) -> FloatArray:
         """Return the state before the first measurement, or after a gap, (18 + 4n,)."""
@@ -115,18 +118,25 @@ class SlipConsensus:
         Raises:
             EstimationError: a measurement is not finite or dt is negative; the caller keeps its state.
         """
-        check_measurement(self.robot, joint_position, joint_velocity, dt)
-        state, *found = _step_kernel(
+        # Here only what a kernel cannot check itself: its cost is that of the whole search.
+        if not (0.0 <= dt < math.inf and joint_position.shape == joint_velocity.shape == self._shape):
+            check_measurement(self.robot, joint_position, joint_velocity, dt)
+        after, fitted, arrays, masks, verdict = _step_kernel(
             self._geometry, np.ascontiguousarray(joint_position, dtype=np.float64),
             np.ascontiguousarray(joint_velocity, dtype=np.float64), float(dt), self._numbers, state,
         )
-        return state, finding_of(*found)
+        if verdict == REFUSED:
+            check_measurement(self.robot, joint_position, joint_velocity, dt)
+        return after, finding_of(fitted, arrays, masks, verdict)
 
 
 @compiled
 def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ignore[no-untyped-def]
     steer_axis, caster_offset, wheel_radius = geometry[:, 0:2], geometry[:, 2:4], geometry[:, 4]
     noise, n = numbers[:8], len(geometry)
+    fitted, arrays, masks = np.empty((4, 3)), np.empty((3, n, 2)), np.zeros((3, n, 2), dtype=np.bool_)
+    if not finite_kernel(position, velocity):
+        return state.copy(), fitted, arrays, masks, REFUSED
     reach, traction = numbers[8], numbers[9]
     anchor, anchor_covariance = state[TWIST : TWIST + 3], state[COVARIANCE : COVARIANCE + 9].copy().reshape((3, 3))
     flagged = state[FLAGS : FLAGS + 2 * n].copy().reshape((n, 2))
@@ -201,7 +211,6 @@ def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ign
         doubt = DOUBT_TIME
     if not checked or leapt or lead < CLEAR_LEAD or doubt > 0.0:
         verdict = _CANNOT_KNOW
-    arrays, masks = np.empty((3, n, 2)), np.zeros((3, n, 2), dtype=np.bool_)
     slip, threshold = arrays[0], arrays[2]
     for k in range(2 * n):
         i, j = k // 2, k % 2
@@ -222,7 +231,6 @@ def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ign
         after[COVARIANCE:FLAGS] = covariance.ravel()
     after[FLAGS : FLAGS + 2 * n] = flagged.ravel()
     after[FLAGS + 2 * n :] = elapsed.ravel()
-    fitted = np.empty((4, 3))
     fitted[0] = twist
     fitted[1:] = covariance
     return after, fitted, arrays, masks, verdict
