@@ -17,6 +17,7 @@ improves. While the last set remains such an optimum it is kept, and searched fo
 It cannot know (`Verdict.CANNOT_KNOW`)
   - where a component that is trusted is the only one to tell a direction of the motion (all others slip);
   - where another set of wheels explains the measurement as well;
+  - where those that are trusted agree no better than wheels that all slip would by chance (`evidence_against_all`);
   - where the wheels agree on a motion that traction cannot have caused: all of them slip, and may do so for a while.
 Slip of all wheels alike that begins gently is within `CONSISTENT`; only another sensor sees it (`imu_slip`).
 """
@@ -50,6 +51,8 @@ from .slip_verdict import (
 LEAP_SHARE = 0.8
 # Cost by which the best hypothesis must lead any other that is neither part of it nor the other way round: odds of 20 to 1.
 CLEAR_LEAD = 3.0
+# Logarithm of the odds, 3 to 1, by which it must be more likely that some wheels roll than that all slip.
+LEAST_EVIDENCE = math.log(3.0)
 # Above this leverage a component is fitted and not checked.
 UNCHECKED = 0.98
 SEARCH_EVERY = 8
@@ -204,6 +207,14 @@ def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ign
     twist[0] += offset_twist[0]
     twist[1] += offset_twist[1]
     twist[2] += offset_twist[2] / reach
+    slip, threshold = arrays[0], arrays[2]
+    for k in range(2 * n):
+        i, j = k // 2, k % 2
+        slip[i, j] = sensed[i, j] - (jacobian[k, 0] * twist[0] + jacobian[k, 1] * twist[1] + jacobian[k, 2] * twist[2])
+        threshold[i, j] = noise[7] * math.sqrt(variance[i, j])
+        masks[0, i, j] = chosen >> k & 1
+    if chosen and checked:
+        checked = evidence_against_all(rows, offset, variance, slip, masks[0]) > LEAST_EVIDENCE
     verdict = _SLIP if chosen else _CONSISTENT
     # Wheels that have leapt together go on together, whether the robot has caught up with them or not.
     doubt = max(state[DOUBT] - dt, 0.0)
@@ -211,12 +222,6 @@ def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ign
         doubt = DOUBT_TIME
     if not checked or leapt or lead < CLEAR_LEAD or doubt > 0.0:
         verdict = _CANNOT_KNOW
-    slip, threshold = arrays[0], arrays[2]
-    for k in range(2 * n):
-        i, j = k // 2, k % 2
-        slip[i, j] = sensed[i, j] - (jacobian[k, 0] * twist[0] + jacobian[k, 1] * twist[1] + jacobian[k, 2] * twist[2])
-        threshold[i, j] = noise[7] * math.sqrt(variance[i, j])
-        masks[0, i, j] = chosen >> k & 1
     after = np.empty(len(state))
     confirm_kernel(masks[0], flagged, elapsed, dt, numbers[10], numbers[11])
     describe_kernel(sensed, slip, threshold, flagged, numbers[12], arrays[1], masks[1], masks[2])
@@ -234,6 +239,51 @@ def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ign
     fitted[0] = twist
     fitted[1:] = covariance
     return after, fitted, arrays, masks, verdict
+
+
+@compiled
+def evidence_against_all(rows, offset, variance, slip, chosen):  # type: ignore[no-untyped-def]
+    """Return the logarithm of the odds that the wheels outside of a set roll, against that all slip in its axes [1].
+
+    In an axis in which wheels slip, with root mean square S, the others may do so as well: the same row, with variance
+    sigma^2 + S^2. Wheels that agree as closely as their noise speak against it, the more so the larger S; two of few that
+    happen to agree do not, so the odds are divided by the number of ways to choose as many. The twist is not known before:
+    these are ratios of marginal likelihoods, with a flat prior of the twist.
+
+    Args:
+        rows: (2n, 3), all unknowns of one size.
+        offset: sensed velocities less those of some twist (2n,) [m/s].
+        variance: of healthy components (n, 2) [m^2/s^2].
+        slip: sensed less fitted velocity (n, 2) [m/s].
+        chosen: the set; the twist is determined without it (n, 2).
+    """
+    n = len(slip)
+    wide, left, ways = variance.copy(), 0, 0.0
+    for j in range(2):
+        count, square = 0, 0.0
+        for i in range(n):
+            if chosen[i, j]:
+                count += 1
+                square += slip[i, j] * slip[i, j]
+                left |= 1 << (2 * i + j)
+        if count:
+            ways += math.lgamma(n + 1.0) - math.lgamma(count + 1.0) - math.lgamma(n - count + 1.0)
+            for i in range(n):
+                wide[i, j] += square / count
+    odds = -ways
+    for kind in range(2):
+        sign, spread = (1.0, variance) if kind == 0 else (-1.0, wide)
+        total = sum_of(parts_of_rows(rows, offset, spread), left)
+        d0 = total[0]
+        d1 = total[3] - total[1] * total[1] / d0
+        b = total[4] - total[1] * total[2] / d0
+        d2 = total[5] - total[2] * total[2] / d0 - b * b / d1
+        odds -= sign * (solve(total, np.zeros(6), False)[0] + 0.5 * math.log(d0 * d1 * d2))
+        for i in range(n):
+            for j in range(2):
+                if not chosen[i, j]:
+                    odds -= sign * 0.5 * math.log(spread[i, j])
+    return odds
 
 
 # Of a twist, so that its inverse exists [m^2/s^2].
