@@ -9,9 +9,10 @@ wheels which agree with it correct. With the velocity u of the place r of the IM
     pose_dot = R(yaw) v, omega          V_ext = (v, omega)
 
 with the biases b and what a floor that is not quite level leaves of gravity, t, which needs no derivative of the gyro. State:
-pose (3), u (2), b_g, b_a (2), t (2); and three errors that stay what they are and are
-never learned, only kept in the covariance (a Schmidt filter): of the common wheel radius, of the mean steering zero, and of
-the scale of the gyro.
+pose (3), u (2), b_g, b_a (2), t (2); and errors that stay what they are and are never learned, only kept in the covariance (a
+Schmidt filter): of the common wheel radius, of the mean steering zero, of the scales of the gyro and of both accelerometers,
+of the place of the IMU and of its clock. As noise they would be averaged out in a long turn, and V_ext be thought to know the
+turning rate from the centripetal acceleration better than any scale allows.
 
 A correction looks for the set of components that slips as `slip_consensus` does, with V_ext and its covariance as what is
 known before, and without a limit to what that may cost: if V_ext says so all wheels slip. What does not slip corrects v. The
@@ -72,15 +73,16 @@ TILT_WALK = 0.1
 # A robot file without an IMU that is given one all the same: of a small industrial one [rad/s], [m/s^2], [Hz].
 GYRO_NOISE, ACCELEROMETER_NOISE, IMU_RATE = 0.002, 0.02, 200.0
 
-X, Y, YAW, UX, UY, GYRO_BIAS, BIAS_X, BIAS_Y, TILT_X, TILT_Y, RADIUS, HEADING, GYRO_SCALE = range(13)
-_STATES, _LEARNED = 13, 10
-# Layout of the state, one array because two control loops pass it on: state of the filter (13) and its covariance (169); sums
+X, Y, YAW, UX, UY, GYRO_BIAS, BIAS_X, BIAS_Y, TILT_X, TILT_Y = range(10)
+RADIUS, HEADING, GYRO_SCALE, SCALE_X, SCALE_Y, PLACE_X, PLACE_Y, LATENESS = range(10, 18)
+_STATES, _LEARNED = 18, 10
+# Layout of the state, one array because two control loops pass it on: state of the filter (18) and its covariance (324); sums
 # of the gyro and of the accelerometer's axes since the last correction and their number; the last sample (3); its age [s];
 # last turning rate [rad/s]; time since any joint moved, time for which the wheels have agreed against V_ext [s]; set of
 # slipping components, measurements since it was searched for, its lead; whether a velocity is known, and whether the wheels
 # told it last; then by caster where the joints stood, flags, and for how long they have been contradicted.
-_P, _SUMS, _SAMPLES, _LAST, _IMU_AGE, _OMEGA, _STANDING, _AGAINST = 13, 182, 185, 186, 189, 190, 191, 192
-_CHOSEN, _SINCE_SEARCH, _LEAD, _STARTED, _TOLD, _JOINTS = 193, 194, 195, 196, 197, 198
+_P, _SUMS, _SAMPLES, _LAST, _IMU_AGE, _OMEGA, _STANDING, _AGAINST = 18, 342, 345, 346, 349, 350, 351, 352
+_CHOSEN, _SINCE_SEARCH, _LEAD, _STARTED, _TOLD, _JOINTS = 353, 354, 355, 356, 357, 358
 _CONSISTENT, _SLIP, _CANNOT_KNOW = int(Verdict.CONSISTENT), int(Verdict.SLIP), int(Verdict.CANNOT_KNOW)
 
 
@@ -165,7 +167,8 @@ class ImuSlip:
             [
                 0.0, 0.0, 0.0, 1.0, 1.0, tolerance["imu.gyro_bias"] ** 2,
                 *2 * [tolerance["imu.accelerometer_bias"] ** 2], *2 * [(GRAVITY * slope) ** 2],
-                tolerance["wheel_radius"] ** 2 / n, tolerance["steer_zero"] ** 2 / n, tolerance["imu.scale"] ** 2,
+                tolerance["wheel_radius"] ** 2 / n, tolerance["steer_zero"] ** 2 / n,
+                *3 * [tolerance["imu.scale"] ** 2], *2 * [tolerance["imu.position"] ** 2], tolerance["clock.offset"] ** 2,
             ]
         )  # fmt: skip
         self._imu_numbers = np.array(
@@ -174,7 +177,7 @@ class ImuSlip:
                 imu.gyro_noise if imu else GYRO_NOISE,
                 imu.accelerometer_noise if imu else ACCELEROMETER_NOISE,
                 1.0 / (imu.rate if imu else IMU_RATE),
-                GRAVITY * slope, tolerance["imu.scale"], tolerance["imu.position"], tolerance["clock.offset"],
+                GRAVITY * slope, tolerance["clock.offset"],
             ]
         )
         encoders = robot.sensors.encoders
@@ -277,13 +280,13 @@ _TOLERANCES = (
 
 # Places of the numbers that the kernels take, after the eight of the noise.
 _REACH, _TRACTION, _CONFIRM, _RELEASE, _RATIO_SPEED, _CREEP, _TIMEOUT, _YIELD = 8, 9, 10, 11, 12, 13, 14, 15
-_RX, _RY, _GYRO_NOISE, _ACCELEROMETER_NOISE, _PERIOD, _TILT, _SCALE, _LEVER, _LATE = 16, 17, 18, 19, 20, 21, 22, 23, 24
-_START_SPEED, _START_GYRO, _START_BIAS = 25, 26, 27
+_RX, _RY, _GYRO_NOISE, _ACCELEROMETER_NOISE, _PERIOD, _TILT, _LATE = 16, 17, 18, 19, 20, 21, 22
+_START_SPEED, _START_GYRO, _START_BIAS = 23, 24, 25
 
 
 @compiled
 def covariance_of(state):  # type: ignore[no-untyped-def]
-    """Return the covariance (13, 13) of the state of the filter."""
+    """Return the covariance (18, 18) of the state of the filter."""
     return state[_P:_SUMS].copy().reshape((_STATES, _STATES))
 
 
@@ -306,10 +309,9 @@ def predict_kernel(numbers, state, gyro, acceleration_x, acceleration_y, dt):  #
 def _carry_on_by_imu(state, numbers, dt):  # type: ignore[no-untyped-def]
     """Carry the state on in place by the last sample, which stands for the time between two of them."""
     gyro, ax, ay = state[_LAST], state[_LAST + 1], state[_LAST + 2]
-    of_scale = numbers[_SCALE] ** 2 * (ax * ax + ay * ay) * CREEP_MEMORY * dt
     _carry_on(
         state, gyro, ax, ay, dt, numbers[_RX], numbers[_RY], numbers[_GYRO_NOISE] ** 2 * numbers[_PERIOD] * dt,
-        numbers[_ACCELEROMETER_NOISE] ** 2 * numbers[_PERIOD] * dt + of_scale, numbers[_TILT], True,
+        numbers[_ACCELEROMETER_NOISE] ** 2 * numbers[_PERIOD] * dt, numbers[_TILT], True,
     )
 
 
@@ -337,6 +339,10 @@ def _carry_on(state, gyro, ax, ay, dt, rx, ry, yaw_variance, speed_variance, til
         f[UY, YAW], f[UY, TILT_X], f[UY, TILT_Y] = tx * dt, s * dt, -c * dt
         # A bias of the gyro moves base_link about the IMU.
         f[X, GYRO_BIAS], f[Y, GYRO_BIAS] = -(c * ry + s * rx) * dt, -(s * ry - c * rx) * dt
+        # Another place of it likewise: v = u - omega x r.
+        f[X, PLACE_X], f[X, PLACE_Y] = s * omega * dt, c * omega * dt
+        f[Y, PLACE_X], f[Y, PLACE_Y] = -c * omega * dt, s * omega * dt
+        f[UX, SCALE_X], f[UY, SCALE_Y] = -(ax - state[BIAS_X]) * dt, -(ay - state[BIAS_Y]) * dt
         f[YAW, GYRO_BIAS], f[YAW, GYRO_SCALE] = -dt, -omega * dt
         f[UX, UY], f[UX, GYRO_BIAS], f[UX, GYRO_SCALE], f[UX, BIAS_X] = omega * dt, -uy * dt, -omega * uy * dt, -dt
         f[UY, UX], f[UY, GYRO_BIAS], f[UY, GYRO_SCALE], f[UY, BIAS_Y] = -omega * dt, ux * dt, omega * ux * dt, -dt
@@ -441,7 +447,7 @@ def _principal_axes(of_good, of_all):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _known_before(state, numbers, dt, inertial, gyro_variance, omega, along, across, row_x, row_y):  # type: ignore[no-untyped-def]
+def _known_before(state, numbers, dt, inertial, gyro_variance, omega, row_x, row_y):  # type: ignore[no-untyped-def]
     """Return the information (6,) on (v_x, v_y, reach omega) before the wheels are asked."""
     matrix = state[_P:_SUMS].reshape((_STATES, _STATES))
     reach, traction = numbers[_REACH], numbers[_TRACTION]
@@ -450,9 +456,6 @@ def _known_before(state, numbers, dt, inertial, gyro_variance, omega, along, acr
     spread[1, 1] = _form(matrix, row_y, row_y) + LEAST_FLOOR**2
     spread[0, 1] = spread[1, 0] = _form(matrix, row_x, row_y)
     if inertial:
-        # Two clocks and a lever arm: what they leave between IMU and wheels while the robot accelerates and turns.
-        spread[0, 0] += (numbers[_LATE] * along) ** 2 + (numbers[_LEVER] * omega) ** 2
-        spread[1, 1] += (numbers[_LATE] * across) ** 2 + (numbers[_LEVER] * omega) ** 2
         turning = matrix[GYRO_BIAS, GYRO_BIAS] + gyro_variance + matrix[GYRO_SCALE, GYRO_SCALE] * omega * omega
         spread[2, 2] = reach * reach * turning + (numbers[_LATE] * traction) ** 2
     else:
@@ -500,13 +503,15 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
     row_y[UY], row_y[RADIUS], row_y[HEADING] = 1.0, reference[1], reference[0]
     if inertial:
         row_x[GYRO_BIAS], row_y[GYRO_BIAS] = -ry, rx
+        # A lever arm and two clocks: what they leave between IMU and wheels while the robot turns and accelerates.
+        row_x[PLACE_Y], row_y[PLACE_X] = reference[2], -reference[2]
+        row_x[LATENESS], row_y[LATENESS] = along - state[BIAS_X], across - state[BIAS_Y]
     prior, cap = np.zeros(6), 1e30
     slip_cost = 0.5 * noise[7] * noise[7]
     if started:
         prior = _known_before(
-            state, numbers, dt, inertial, gyro_variance, reference[2], along - state[BIAS_X], across - state[BIAS_Y],
-            row_x, row_y,
-        )  # fmt: skip
+            state, numbers, dt, inertial, gyro_variance, reference[2], row_x, row_y
+        )
         if not inertial:
             cap = LEAP_SHARE * slip_cost
     slip_costs = np.full(2 * n, slip_cost)
@@ -554,7 +559,7 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
         if dt > 0.0 and inertial:
             crept = numbers[_CREEP] * math.hypot(along - state[BIAS_X], across - state[BIAS_Y])
             crept *= math.hypot(wheels[0], wheels[1])
-            slow = 2.0 * CREEP_MEMORY / dt * crept * crept + (numbers[_LEVER] * wheels[2]) ** 2
+            slow = 2.0 * CREEP_MEMORY / dt * crept * crept
         for k in range(2):
             c, s = axes[k, 0], axes[k, 1]
             omega = gyro - state[GYRO_BIAS] if inertial else wheels[2]
