@@ -141,6 +141,19 @@ def test_all_wheels_that_slip_each_in_its_own_way_cannot_be_known():
     assert found(THESIS, position, velocity).verdict is Verdict.CANNOT_KNOW
 
 
+@pytest.mark.parametrize(("apart", "verdict"), [(0.0, Verdict.SLIP), (0.02, Verdict.CANNOT_KNOW)])
+def test_two_of_four_must_agree_better_than_by_chance(apart, verdict):
+    """Both are within the gate; 20 mm/s apart, 4 to 5 standard deviations, they are as likely to slip as the others."""
+    detector = SlipConsensus(THESIS, confirm=AT_ONCE)
+    position, velocity = rolling(THESIS, (0.5, 0.0, 0.0), np.zeros(4))
+    state, _ = detector.step(detector.initial_state(), position, velocity, 0.0)
+    velocity[:, 0] += np.array([0.5 * apart, -0.5 * apart, 0.15, 0.3]) / THESIS.wheel_radius
+    for _ in range(20):
+        state, finding = detector.step(state, position, velocity, 0.002)
+    assert np.flatnonzero(finding.suspect[:, 0]).tolist() == [2, 3]
+    assert finding.verdict is verdict
+
+
 def test_a_leap_of_all_wheels_is_no_motion_that_traction_causes():
     """Slip of all wheels alike leaves no residual; that it begins faster than the robot can move is all there is to see."""
     detector = SlipConsensus(THESIS)
