@@ -153,7 +153,9 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
     assert caster in done.stdout
 
 
-@pytest.mark.parametrize("name", ["flow_base", "xr4000", "dyros_pcv", "tidybot2"])
+@pytest.mark.parametrize(
+    "name", ["flow_base", "dyros_pcv", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("xr4000", "tidybot2"))]
+)
 def test_intervals_hold_the_truth_on_other_robots(name: str, tmp_path: Path) -> None:
     """Other sizes, offsets and gear couplings; the friction is 4 % of what the drive can give."""
     nominal = load_robot(name)

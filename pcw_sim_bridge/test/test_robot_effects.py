@@ -14,15 +14,16 @@ from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
+NIGHTLY = pytest.mark.nightly
 CONCEALED = [
     ("pybullet", {"name": "wheel_radius_error", "target": ["front_left"], "error": 1.0e-3}),
-    ("reduced", {"name": "wheel_radius_error", "target": list(THESIS.caster_names), "error": 1.5e-3}),
+    pytest.param("reduced", {"name": "wheel_radius_error", "target": [*THESIS.caster_names], "error": 1.5e-3}, marks=NIGHTLY),
     ("pybullet", {"name": "steer_zero_offset", "target": ["front_right"], "offset": 0.03}),
     ("reduced", {"name": "caster_offset_error", "target": ["rear_left"], "x": 3e-3}),
-    ("reduced", {"name": "imu_bias", "target": ["imu"], "gyro": 0.03}),
-    ("pybullet", {"name": "imu_scale", "target": ["imu"], "gyro": 0.05}),
-    ("pybullet", {"name": "imu_lever_arm", "target": ["imu"], "x": 0.08}),
-    ("reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02}),
+    pytest.param("reduced", {"name": "imu_bias", "target": ["imu"], "gyro": 0.03}, marks=NIGHTLY),
+    pytest.param("pybullet", {"name": "imu_scale", "target": ["imu"], "gyro": 0.05}, marks=NIGHTLY),
+    pytest.param("pybullet", {"name": "imu_lever_arm", "target": ["imu"], "x": 0.08}, marks=NIGHTLY),
+    pytest.param("reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02}, marks=NIGHTLY),
     ("pybullet", {"name": "ground_slope", "target": ["chassis"], "angle": 0.03, "direction": 1.0}),
     ("reduced", {"name": "aerodynamic_drag", "target": ["chassis"], "coefficient": 8.0}),
     ("pybullet", {"name": "payload_offset", "target": ["chassis"], "x": 0.05}),
