@@ -21,6 +21,7 @@ def test_healthy_robots_have_no_fault():
     assert all(diagnose(seed, "none", duration=8.0).right for seed in range(300, 304))
 
 
+@pytest.mark.nightly
 def test_slip_is_no_fault():
     for seed in range(400, 406):
         driven = drawn_scenario(seed).driven

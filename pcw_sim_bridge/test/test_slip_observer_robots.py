@@ -48,6 +48,7 @@ def random_robot(seed: int, n: int) -> RobotDescription:
     return parse_robot(mapping)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("measured", ["speed", "angle"])
 def test_shipped_robots_are_followed_where_encoders_are_blind(name, measured):
@@ -66,7 +67,10 @@ def test_shipped_robots_are_followed_where_encoders_are_blind(name, measured):
     assert found.outside < 0.03
 
 
-@pytest.mark.parametrize(("seed", "n"), [(1, 3), (2, 4), (3, 6), (4, 2)])
+OTHERS = [pytest.param(seed, n, marks=pytest.mark.nightly) for seed, n in ((2, 4), (3, 6), (4, 2))]
+
+
+@pytest.mark.parametrize(("seed", "n"), [(1, 3), *OTHERS])
 def test_robots_that_nobody_has_seen(seed, n):
     robot = random_robot(seed, n)
     run = drive_run(robot, [0], seed, duration=3.0)
@@ -75,6 +79,7 @@ def test_robots_that_nobody_has_seen(seed, n):
     assert found.outside < 0.03
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("model", ["magic_formula", "dugoff", "burckhardt"])
 def test_other_friction_curves(model):
     thesis = load_robot("thesis")
