@@ -108,6 +108,7 @@ def test_the_other_methods_have_the_same_interface(ros, method):
         assert all(len(m.position) == len(m.effort) == 0 for m in slip)
 
 
+@pytest.mark.nightly  # on a loaded machine messages are lost, and with them what it waits for
 def test_gaps_and_stamps_that_repeat_or_go_back_are_counted_and_it_begins_anew(ros):
     _, slip, diagnostics, robot = start(ros)
     robot.run(lambda: len(slip) > 30 and len(slip[-1].velocity) > 0)
