@@ -29,7 +29,7 @@ import numpy as np
 from pcw_description.differential_kinematics import forward_kinematics_kernel, wheel_jacobian_kernel
 from pcw_description.robot_description import LONGITUDINAL, STEER, FloatArray, RobotDescription
 
-from .errors import EstimationError
+from .errors import EstimationError, require_not_negative
 from .slip_verdict import SlipFinding, Verdict
 
 
@@ -57,12 +57,7 @@ class EncoderSlipParameters:
         Raises:
             EstimationError: names the field, its value and what is allowed.
         """
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            least_excluded = field.name in ("floor", "ratio_speed")
-            if not math.isfinite(value) or value < 0.0 or (least_excluded and value == 0.0):
-                allowed = "a positive number" if least_excluded else "a finite number, at least 0"
-                raise EstimationError(f"{field.name} = {value!r} is not allowed; allowed: {allowed}")
+        require_not_negative(self, positive=("floor", "ratio_speed"))
 
 
 @dataclasses.dataclass(frozen=True)

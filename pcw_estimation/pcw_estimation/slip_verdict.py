@@ -12,7 +12,7 @@ import numpy as np
 from pcw_description.compiled import compiled
 from pcw_description.robot_description import FloatArray, RobotDescription
 
-from .errors import EstimationError
+from .errors import EstimationError, require_not_negative
 
 
 class Verdict(enum.IntEnum):
@@ -55,12 +55,7 @@ class ConfirmParameters:
         Raises:
             EstimationError: names the field, its value and what is allowed.
         """
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            excluded = field.name == "ratio_speed"
-            if not math.isfinite(value) or value < 0.0 or (excluded and value == 0.0):
-                allowed = "a positive number" if excluded else "a finite number, at least 0"
-                raise EstimationError(f"{field.name} = {value!r} is not allowed; allowed: {allowed}")
+        require_not_negative(self, positive=("ratio_speed",))
 
 
 class SlipFinding(NamedTuple):
