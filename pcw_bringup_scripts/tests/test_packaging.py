@@ -28,6 +28,8 @@ MAY_STAND_AT_THE_TOP = {*PACKAGES, "README.md", "LICENSE"}
 KEY_OF_MODULE = {
     "PIL": "python3-pil",
     "can": "python3-can",
+    "canopen": "canopen-pip",
+    "cantools": "python3-cantools-pip",
     "jinja2": "python3-jinja2",
     "markupsafe": "python3-markupsafe",
     "lz4": "mcap-ros2-support",
@@ -39,6 +41,7 @@ KEY_OF_MODULE = {
     "numpy": "python3-numpy",
     "pybullet": "python3-pybullet-pip",
     "pytest": "python3-pytest",
+    "quadprog": "quadprog-pip",
     "rosbags": "python3-rosbags-pip",
     "scipy": "python3-scipy",
     "yaml": "python3-yaml",
