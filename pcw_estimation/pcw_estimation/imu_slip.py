@@ -9,22 +9,23 @@ wheels which agree with it correct. With the velocity u of the place r of the IM
     pose_dot = R(yaw) v, omega          V_ext = (v, omega)
 
 with the biases b and what a floor that is not quite level leaves of gravity, t, which needs no derivative of the gyro. State:
-pose (3), u (2), b_g, b_a (2), t (2), s_g; and errors that stay what they are and are never learned, only kept in the covariance (a
-Schmidt filter): of the common wheel radius, of the mean steering zero, of the scales of both accelerometers, of the place of
-the IMU and of its clock. As noise they would be averaged out in a long turn, and V_ext be thought to know the
+pose (3), u (2), b_g, b_a (2), t (2), s_g; and errors that stay what they are and are never learned, only kept in the
+covariance (a Schmidt filter): of the common wheel radius, of the mean steering zero, of the scales of both accelerometers, of
+the place of the IMU and of its clock. As noise they would be averaged out in a long turn, and V_ext be thought to know the
 turning rate from the centripetal acceleration better than any scale allows.
 
 The turning rate of wheels with errors of radius, heading and place is wrong in proportion to the motion,
 
     omega_wheels = omega + k_x v_x + k_y v_y + k_omega omega,
 
-and the three k are such errors as well. Where wheels slip and are left out, those that remain have other k; their turning
-rate then counts as one measurement per `MOTION_MEMORY`.
+and the three k are such errors as well. Where wheels slip and are left out, those that remain have other k; their turning rate
+then counts as one measurement per `MOTION_MEMORY`.
 
 A correction looks for the set of components that slips as `slip_consensus` does, with V_ext and its covariance as what is
 known before, and without a limit to what that may cost: if V_ext says so all wheels slip. What does not slip corrects v. A
-robot whose joints stand still does not turn, and that counts in full (b_g and b_a are learned at standstill). A tyre that accelerates the robot creeps, by lambda_p / (2 mu_p g) of speed and acceleration; that
-error lasts as long as an acceleration and is weighted accordingly.
+robot whose joints stand still does not turn, and that counts in full (b_g and b_a are learned at standstill). A tyre that
+accelerates the robot creeps, by lambda_p / (2 mu_p g) of speed and acceleration; that error lasts as long as an acceleration
+and is weighted accordingly.
 
 Where the wheels agree with each other for `yield_time`, but not with V_ext, they are believed: a ramp tilts gravity into the
 accelerometer, and no IMU of this kind can hold a velocity for long.
@@ -594,7 +595,7 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
     if rank:
         wheels[2] = reference[2] + solve(total, np.zeros(6), False)[3] / reach
     spin_variance = full_inverse(total)[2, 2] / reach**2 if rank else (numbers[_TRACTION] / reach) ** 2
-    # All wheels: what their geometry does to the turning rate is in the state; beside it there may be slip too small to be told.
+    # All wheels: what their geometry does to the turning rate is in the state; what slip is too small to be told is not.
     spun, passing = np.zeros(3), spin_variance * 2.0 * MOTION_MEMORY / max(dt, 1e-9)
     if chosen == 0 and rank and dt > 0.0:
         spun[:] = wheels

@@ -89,10 +89,10 @@ LEAST_LOAD = 0.05
 # Directions of motion that the trusted wheels do not determine are left alone by a ridge of this size.
 RIDGE = 1e-3
 
-# Forces and accelerations that part for most of so much time in which there is something to compare [s] are no spinning wheels;
-# they are compared over the first, where the robot accelerates by the second [s], [m/s^2], [s].
-COMPARED_TIME, LEAST_ACCELERATION, MISMATCH_TIME = 0.05, 0.1, 3.0
-MISMATCH_SHARE = 0.7
+# Forces and accelerations are compared over a time, where the robot accelerates by at least so much [s], [m/s^2]. Where they
+# part for most of a longer time [s] it is no wheel that spins.
+COMPARED_TIME, LEAST_ACCELERATION = 0.05, 0.1
+MISMATCH_TIME, MISMATCH_SHARE = 3.0, 0.7
 
 # No robot on casters is faster, or turns faster [m/s], [rad/s].
 FASTEST, FASTEST_TURNING = 100.0, 300.0
