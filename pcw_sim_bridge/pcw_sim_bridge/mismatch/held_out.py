@@ -130,24 +130,30 @@ class HeldOut:
         return total
 
     def help_of(self, index: int) -> tuple[float, float]:
-        """What an effect takes from the error of held-out data, and how much it does there at all [nats].
+        """How much better held-out data are foretold with an effect than without, and how much it does there at all [nats].
 
-        Half the whitened squared error; what the description's numbers would have to move without it counts as well.
+        The first is the logarithm of the ratio of their predictive densities, log p(held out | fitted): numbers of the
+        description that the fitted data leave open are open for both, and what they would have to move is counted once.
         """
-        both, alone = self.means(), self.means(index)
-        error = 0.5 * (self._error(alone) - self._error(both)) + self._retuning(alone) - self._retuning(both)
+        kept = self._kept(index)
+        help_ = self._foretold(self._kept(None)) - self._foretold(kept)
         rows = slice(*self.span(index))
-        work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
-        return error, 0.5 * float(work)
+        work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(self.means(), self.test, strict=True))
+        return help_, 0.5 * float(work)
 
-    def _error(self, means: FloatArray) -> float:
-        extended = np.concatenate([-means, np.ones((len(means), 1))], axis=1)
-        return float(np.einsum("fi,fij,fj->", extended, self.test, extended))
+    def _foretold(self, kept: IntArray) -> float:
+        """Logarithm of the predictive density of all folds, but for what no choice of columns changes."""
+        return sum(
+            self._log_evidence(train + test, kept) - self._log_evidence(train, kept)
+            for train, test in zip(self.train, self.test, strict=True)
+        )
 
-    def _retuning(self, means: FloatArray) -> float:
-        """Half the squared distance of the description's numbers from nominal, in tolerances."""
-        moved = means[:, : self.nuisances] / self.deviations[: self.nuisances]
-        return 0.5 * float(np.mean(np.sum(moved**2, axis=1)))
+    def _log_evidence(self, gram: FloatArray, kept: IntArray) -> float:
+        """Logarithm of the density of data with a Gram matrix, over the prior of the columns that are kept."""
+        deviations = self.deviations[kept]
+        factor = np.linalg.cholesky(np.outer(deviations, deviations) * gram[np.ix_(kept, kept)] + np.eye(len(kept)))
+        half = np.linalg.solve(factor, deviations * gram[kept, -1])
+        return -float(np.sum(np.log(np.diag(factor)))) - 0.5 * float(gram[-1, -1] - half @ half)
 
 
 def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> RegressionProblem:

@@ -28,6 +28,7 @@ from .subject import Opened, Subject
 from .whitened_regression import Instance
 
 HEALTHY = 3.0  # tolerances
+LEAST_PROBABILITY = 0.01  # of a name: below it stands for another one
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
 LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to speak against an effect
@@ -205,8 +206,11 @@ class Prover:
         Against one that is said to be ambiguous the held-out data have to speak as clearly as look-alikes are separated.
         """
         doubted = {named.instance for named in explanation.named if named.ambiguous_with}
+        believed = {named.instance: named.probability for named in explanation.named}
         found = []
         for index in held_out.proposed:
+            if believed.get(held_out.instances[index], 1.0) < LEAST_PROBABILITY:
+                return index, "an effect that is not proposed explains by far more"
             nats, work = held_out.help_of(index)
             if work > AT_WORK and nats <= (-AMBIGUOUS if held_out.instances[index] in doubted else 0.0):
                 found.append((nats, index))
