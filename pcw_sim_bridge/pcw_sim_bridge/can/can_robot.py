@@ -551,14 +551,26 @@ class CanRobot:
     def _adopt_mark(self, name: str, homing: Homing) -> None:
         """Take the drive's new count, which is zero at the mark; what the wheel reads does not jump."""
         place = joint_place(self.robot, name)
+        drive_zero = next(drive.joint.zero for drive in self.drives if drive.name == name)
         before = None if self._reading is None else float(self._reading.joints.position[place[0], DRIVE])
-        self.map.zero[place] = -homing.position
+        self.map.zero[place] = drive_zero - homing.position
         after = self._joint_reading().position[place[0], DRIVE]
         if before is not None:
             self.map.zero[place[0], DRIVE] += after - before
         for watch in self._watches:
             if watch.drive.name.rpartition("_")[0] == name.rpartition("_")[0]:
                 watch.forget()
+
+    def shift_steer_zeros(self, offset: FloatArray) -> None:
+        """Take offsets (n,) [rad] off what the steering axes read from now on; a wheel's reading does not jump.
+
+        Raises:
+            CanError: while torque is on.
+        """
+        if self.armed or self._enabling_since is not None:
+            raise CanError("new zeros are not allowed while torque is on; allowed: without torque")
+        with self._lock:
+            self.map.zero[:, STEER] += offset
 
     # --- For people --------------------------------------------------------------------------------------
 

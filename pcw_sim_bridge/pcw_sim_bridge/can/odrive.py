@@ -38,7 +38,7 @@ ERRORS = {
 # Silence after which a message that should come by itself is missed [s].
 CYCLIC_WAIT = 0.5
 STATE_REPEAT = 0.05  # between two requests for a state [s]
-TEMPERATURE_RATE = 10.0  # that is expected of the drive [Hz]
+TEMPERATURE_RATE = 25.0  # that is expected of the drive, so that heat is seen within the timeout [Hz]
 
 
 @functools.cache

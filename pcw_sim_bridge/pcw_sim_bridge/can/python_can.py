@@ -6,6 +6,7 @@ import contextlib
 import errno
 import selectors
 import time
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,7 @@ class PythonCanTransport:
         self._log = None if log is None else FrameLogWriter(log)
         self._selector = selectors.DefaultSelector()
         self._polled: list[str] = []
+        self._echoes = {bus.name: Echoes() for bus in buses if bus.interface == "udp_multicast"}
         self.sent = {bus.name: 0 for bus in buses}
         self.received = {bus.name: 0 for bus in buses}
         try:
@@ -117,6 +119,8 @@ class PythonCanTransport:
                 raise TransmitBufferFull(f"{bus}: {error}") from error
             raise BusOff(f"{bus}: {error}") from error
         self.sent[bus] += 1
+        if bus in self._echoes:
+            self._echoes[bus].sent(frame, time.monotonic())
         if self._log is not None:
             self._log.write(bus, frame, time.time(), sent=True)
 
@@ -147,6 +151,8 @@ class PythonCanTransport:
             if message.is_fd:
                 continue
             frame = to_frame(message)
+            if name in self._echoes and self._echoes[name].is_own(frame, time.monotonic()):
+                continue
             self.received[name] += 1
             arrived.append(Arrived(name, frame, time.monotonic()))
             if self._log is not None:
@@ -160,6 +166,41 @@ class PythonCanTransport:
                 bus.shutdown()
         if self._log is not None:
             self._log.close()
+
+
+class Echoes:
+    """Tells the frames that a bus gives back to who sent them: udp_multicast does, and says nothing of where they are from."""
+
+    LONGEST = 2.0  # after which an echo that has not come is lost [s]
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, Frame]] = deque()
+        self._expected: Counter[Frame] = Counter()
+
+    def sent(self, frame: Frame, now: float) -> None:
+        """Expect the echo of a frame."""
+        while self._sent and now - self._sent[0][0] > self.LONGEST:
+            old = self._sent.popleft()[1]
+            if self._expected[old] > 1:
+                self._expected[old] -= 1
+            else:
+                self._expected.pop(old, None)
+        self._sent.append((now, frame))
+        self._expected[frame] += 1
+
+    def is_own(self, frame: Frame, now: float) -> bool:
+        """Whether a frame is an echo that was expected; each is expected once."""
+        if not self._expected.get(frame):
+            return False
+        self._expected[frame] -= 1
+        if not self._expected[frame]:
+            del self._expected[frame]
+        # Echoes come in the order of sending, so its entry is near the front.
+        for i, (_, sent) in enumerate(self._sent):
+            if sent == frame:
+                del self._sent[i]
+                break
+        return True
 
 
 class FrameLogWriter:
