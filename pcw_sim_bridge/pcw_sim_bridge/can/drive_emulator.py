@@ -75,6 +75,7 @@ class FaultTimer:
         self._open: list[dict[str, Any]] = []
         self.had_torque = False
         self.stopped_after: list[float] = []  # from the last command to zero torque, each time that torque ended [ms]
+        self.stopped_at: list[float] = []  # when it ended [s]
 
     def begin(self, name: str, where: str) -> None:
         """Inject a fault and start timing it."""
@@ -93,6 +94,7 @@ class FaultTimer:
             return
         if self.had_torque:
             self.had_torque = False
+            self.stopped_at.append(time)
             last = max(drive.command_time for drive in self._emulated.drives)
             self.stopped_after.append(round((time - last) * 1000, 2))
         begun = self._emulated.start
