@@ -216,16 +216,6 @@ def _check_joint(joint: DriveJoint, where: str, read: CanFile, robot: RobotDescr
 
 def _check_ids(read: CanFile) -> None:
     """Refuse two owners of one identifier on one bus."""
-    owners: dict[tuple[str, int], str] = {}
-    for i, joint in enumerate(read.joints):
-        for identifier in identifiers(joint):
-            other = owners.setdefault((joint.bus, identifier), joint.name)
-            if other != joint.name:
-                raise DescriptionError(
-                    f"joints[{i}].node_id", int(joint.node_id),
-                    f"identifier 0x{identifier:03X} on {joint.bus} is that of {other} already; "
-                    "allowed: identifiers that do not meet (put the protocols on buses of their own)",
-                )  # fmt: skip
     for i, joint in enumerate(read.joints):
         reserved = {0x000: "NMT", 0x080: "SYNC", 0x700 + int(read.master_id): "the master's heartbeat"}
         if any(other.bus == joint.bus and other.protocol == "cia402" for other in read.joints):
@@ -236,6 +226,16 @@ def _check_ids(read: CanFile) -> None:
                         f"identifier 0x{identifier:03X} is {reserved[identifier]} of CANopen on the same bus; "
                         "allowed: a bus of its own",
                     )  # fmt: skip
+    owners: dict[tuple[str, int], str] = {}
+    for i, joint in enumerate(read.joints):
+        for identifier in identifiers(joint):
+            other = owners.setdefault((joint.bus, identifier), joint.name)
+            if other != joint.name:
+                raise DescriptionError(
+                    f"joints[{i}].node_id", int(joint.node_id),
+                    f"identifier 0x{identifier:03X} on {joint.bus} is that of {other} already; "
+                    "allowed: identifiers that do not meet (put the protocols on buses of their own)",
+                )  # fmt: skip
 
 
 def identifiers(joint: DriveJoint) -> tuple[int, ...]:

@@ -31,7 +31,7 @@ from ..plants.factory import make_plant
 from ..simulate import added_physics
 from ..simulated_robot import JointCommand
 from ..simulated_run import record_run
-from .can_file import CanFile, read_can_file
+from .can_file import CanFile, joint_place, read_can_file
 from .can_robot import CanRobot, TimedReading
 from .drive_emulator import FaultTimer
 from .drive_set import bus_loads, make_drives
@@ -58,6 +58,8 @@ FAULT_TRIALS = (
     ("transmit_buffer_full", "computer", ("transmit_buffer_full",)),
     ("driver_killed", "computer", ()),
 )
+# An encoder that stands shows in motion alone; at this speed of the joint it must [rad/s].
+STUCK_SPEED = 1.5
 DETECTED_BY_DRIVE_ALONE = {("hot", "cia402")}  # the profile has no object for a temperature
 
 
@@ -114,9 +116,12 @@ def fault_trial(rig: Rig, fault: str, kind: str, names: Sequence[str], rng: np.r
     rig.torque = np.zeros((rig.robot.n, 2))
     rig.torque[:, DRIVE] = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
     can.enable()
-    # A standing encoder shows only in motion: it is given time to come up to speed.
-    rig.cycles(int(rng.integers(150 if fault == "encoder_stuck" else 20, 250)))
+    rig.cycles(int(rng.integers(20, 250)))
     assert can.armed and np.abs(emulated.motor_torques()).max() > 0.0
+    if fault == "encoder_stuck":
+        place = joint_place(rig.robot, where)
+        while can.reading is None or abs(can.reading.joints.velocity[place]) < STUCK_SPEED:
+            rig.cycles(1)
     rig.transport.receive(float(rng.uniform(0.0, can.period)))  # at any time within a period
     begun = emulated.time
     if kind == "computer":
