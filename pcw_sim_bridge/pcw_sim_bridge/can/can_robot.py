@@ -127,7 +127,7 @@ class CanRobot:
         self.homing_results: dict[str, str] = {}
         self._command: JointCommand | None = None
         self._command_time: float | None = None
-        self._sent_in_cycle = False
+        self._sent_in_cycle = self._waiting = False  # a command has gone out in this period; a newer one waits for the next
         self._next_tick: float | None = None
         self._next_heartbeat = -np.inf
         self._published_time = -np.inf
@@ -234,7 +234,10 @@ class CanRobot:
                 raise CanError(f"torque is not allowed after {'; '.join(map(str, self.faults))}; allowed: clear_faults first")
             if self._homing:
                 raise CanError(f"torque is not allowed while {', '.join(self._homing)} look for their marks; allowed: afterwards")
-            self._command, self._command_time = None, None
+            self._command, self._command_time, self._sent_in_cycle = None, None, False
+            for drive in self.drives:
+                if drive.feedback.state is DriveState.ENABLED:
+                    drive.feedback.state = DriveState.DISABLED  # said before it was told to be; it has to say so anew
             self._enabling_since = self.transport.now()
 
     def request_disable(self) -> None:
@@ -292,9 +295,10 @@ class CanRobot:
             self.counters.commands += 1
             if command is None:
                 self.counters.refused_commands += 1
-            if self._sent_in_cycle:
+            if self._waiting:
                 self.counters.held_back += 1
             self._command, self._command_time = command, now
+            self._waiting = self._sent_in_cycle
             if self.armed and not self._sent_in_cycle:
                 self._send_outputs(now)
                 self._sent_in_cycle = True
@@ -360,9 +364,9 @@ class CanRobot:
             self._next_tick = now
         self.counters.cycles += 1
         with self._lock:
-            if self.configured and not self._sent_in_cycle:
+            if self.configured and (self._waiting or not self._sent_in_cycle):
                 self._send_outputs(now)
-            self._sent_in_cycle = False
+            self._sent_in_cycle = self._waiting = False
             for bus in self._canopen_buses:
                 self._send(bus, Frame(SYNC))
             self._sync_time = now
@@ -474,6 +478,8 @@ class CanRobot:
     def _look_at_enabling(self, now: float) -> None:
         assert self._enabling_since is not None
         missing = [drive for drive in self.drives if drive.feedback.state is not DriveState.ENABLED]
+        if now - self._enabling_since < 1.5 * self.period:
+            return  # what comes now was sent before the drives were told
         if not missing:
             self._enabling_since, self.armed = None, True
         elif now - self._enabling_since > ENABLE_TIME:

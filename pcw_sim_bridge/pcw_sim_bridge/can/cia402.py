@@ -36,6 +36,7 @@ MODE_BIT = {PROFILE_VELOCITY: 2, PROFILE_TORQUE: 3, HOMING: 5, CYCLIC_SYNCHRONOU
 # Controlwords.
 DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, FAULT_RESET = 0x00, 0x06, 0x07, 0x0F, 0x02, 0x80
 START_HOMING = 0x1F
+SWITCH_ON_DISABLED = 0x0040  # of the statusword
 HOMING_ATTAINED, HOMING_ERROR = 1 << 12, 1 << 13
 # Homing methods 0x6098 by ours and the direction: on the index pulse 34 and 33, on a home switch 24 and 28.
 HOMING_METHOD = {("index", 1): 34, ("index", -1): 33, ("switch", 1): 24, ("switch", -1): 28}
@@ -193,6 +194,8 @@ class Cia402Drive(Drive):
 
     def output(self, want: Want, now: float) -> list[Frame]:
         """Return one RPDO: that of torque, or of velocity when that is wanted."""
+        if self._begins(want) and self.feedback.state is not DriveState.FAULT:
+            self.statusword = SWITCH_ON_DISABLED
         if not want.enabled:
             self._homing_asked = False
             return [self._torque_frame(DISABLE_VOLTAGE, 0.0, self._torque_mode)]

@@ -125,6 +125,14 @@ class Drive(ABC):
         self.identity = ""
         self.notes: list[str] = []  # what `configure` found that is worth saying
         self.refused_frames = 0
+        self._was_enabled = False
+
+    def _begins(self, want: Want) -> bool:
+        """Whether torque is wanted now and was not before. What the drive said until now is of before then, and is forgotten."""
+        begins, self._was_enabled = want.enabled and not self._was_enabled, want.enabled
+        if begins and self.feedback.state is DriveState.ENABLED:
+            self.feedback.state = DriveState.DISABLED
+        return begins
 
     @property
     def name(self) -> str:

@@ -205,6 +205,8 @@ class ODriveDrive(Drive):
     def output(self, want: Want, now: float) -> list[Frame]:
         """Return the torque or velocity, and before it a change of state or mode where one is needed."""
         node, frames = self.node_id, []
+        if self._begins(want):
+            self.axis_state, self._asked_state = IDLE, IDLE
         if not want.enabled:
             self._homing_asked = False
             frames.append(self._torque.frame(node, 0.0))

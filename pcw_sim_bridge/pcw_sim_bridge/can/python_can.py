@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import selectors
+import struct
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -251,7 +252,7 @@ def read_log(path: str | Path) -> Iterator[tuple[str, Frame, float]]:
             for message in reader:
                 if not message.is_fd:
                     yield str(message.channel), to_frame(message), message.timestamp
-    except (OSError, ValueError, can.CanError, IndexError) as error:
+    except (OSError, ValueError, can.CanError, IndexError, struct.error) as error:
         raise CanError(f"log {path} cannot be read: {error}; allowed: candump, ASC or BLF") from error
 
 

@@ -12,7 +12,7 @@
 
 A step of position of a motor is explained if it is within `encoder_jump` times the gear, plus what the speed makes of the
 uncertainty of when it was read, of the mean of the speeds before and after times the time between. A standing encoder is so
-found 20 ms plus 0.3 `encoder_jump` over the speed after it stopped: within 50 ms above 1 rad/s of the joint by default.
+found 20 ms plus 0.2 `encoder_jump` over the speed after it stopped: within 50 ms above 1 rad/s of the joint by default.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ TORQUE_MARGIN = 1.25
 # What the computer does not know of when a position was read, for one period and over several [s].
 TIME_UNCERTAINTY = 0.010
 # Of `encoder_jump`, what may stand between position and integrated speed: it grows slowly, so that less of it is by chance.
-DRIFT_SHARE = 0.3
+DRIFT_SHARE = 0.2
 # Time constant over which position and integrated speed are held against each other [s].
-DRIFT_TIME = 0.1
+DRIFT_TIME = 0.2
 
 
 class Fault(NamedTuple):
