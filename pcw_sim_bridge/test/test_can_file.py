@@ -151,7 +151,9 @@ def test_the_motor_map_is_power_preserving_and_its_own_inverse(name):
     assert power == pytest.approx(np.sum(torque * rate))
 
 
-@given(st.lists(st.floats(allow_nan=True, allow_infinity=True, width=64), min_size=8, max_size=8), st.booleans(), st.booleans())
+@given(
+    st.lists(st.floats(allow_nan=True, allow_infinity=True, width=64), min_size=8, max_size=8), st.booleans(), st.booleans()
+)
 def test_the_gate_lets_nothing_out_beyond_the_limits(values, armed, velocity):
     file = dataclasses.replace(made())
     gate = OutputGate(THESIS, file, MotorMap(THESIS, file))

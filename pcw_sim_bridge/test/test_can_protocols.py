@@ -91,7 +91,7 @@ class Serving:
 
 
 def test_canopens_master_configures_and_drives_the_emulated_drive():
-    """SDO up and down, segmented strings, aborts, PDO mapping read back, NMT, heartbeat, SYNC, TPDOs and RPDOs: by `canopen`."""
+    """SDO up and down, segmented strings, aborts, PDO mapping read back, NMT, heartbeat, SYNC and PDOs: by `canopen`."""
     drive = EmulatedCia402(made().joints[0], 250.0, 0.02, 0.5, 4096)
     drive.position, drive.velocity, drive.torque = 12.5, 3.0, 0.1
     network = canopen.Network()
@@ -265,7 +265,8 @@ def test_identifiers_and_widths_are_those_of_the_protocol():
         "Get_Version": (0x00, 8), "Heartbeat": (0x01, 8), "Estop": (0x02, 0), "Get_Error": (0x03, 8),
         "Set_Axis_State": (0x07, 4), "Get_Encoder_Estimates": (0x09, 8), "Set_Controller_Mode": (0x0B, 8),
         "Set_Input_Vel": (0x0D, 8), "Set_Input_Torque": (0x0E, 4), "Set_Limits": (0x0F, 8), "Get_Iq": (0x14, 8),
-        "Get_Temperature": (0x15, 8), "Get_Bus_Voltage_Current": (0x17, 8), "Clear_Errors": (0x18, 1), "Get_Torques": (0x1C, 8),
+        "Get_Temperature": (0x15, 8), "Get_Bus_Voltage_Current": (0x17, 8), "Clear_Errors": (0x18, 1),
+        "Get_Torques": (0x1C, 8),
     }  # fmt: skip
     assert {m.name: (m.frame_id, m.length) for m in database().messages} == published
 
@@ -306,7 +307,9 @@ def test_an_odrive_goes_through_its_states():
 def test_no_frame_crashes_a_drive_or_makes_its_numbers_nan(protocol, data):
     drive = make_drives(THESIS, made(protocol))[0]
     emulated = (
-        EmulatedCia402(drive.joint, 250.0, 0.02, 0.04, 4096) if protocol == "cia402" else EmulatedODrive(drive.joint, 250.0, 0.02, 0.04)
+        EmulatedCia402(drive.joint, 250.0, 0.02, 0.04, 4096)
+        if protocol == "cia402"
+        else EmulatedODrive(drive.joint, 250.0, 0.02, 0.04)
     )
     for _ in range(data.draw(st.integers(1, 8))):
         identifier = data.draw(st.sampled_from([*drive.identifiers, *drive.command_identifiers, 0x000, 0x080, 0x601, 0x77F]))

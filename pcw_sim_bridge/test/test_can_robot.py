@@ -17,7 +17,14 @@ from pcw_sim_bridge.can.errors import CanError
 from pcw_sim_bridge.can.frame import ERROR_BUS_OFF, Arrived, Frame
 from pcw_sim_bridge.can.starting_file import starting_content, with_joints
 from pcw_sim_bridge.can.steer_zero import estimate_steer_zeros, write_zeros
-from pcw_sim_bridge.can.trials import ALLOWED_MS, DETECTED_BY_DRIVE_ALONE, FAULT_TRIALS, Rig, fault_trial, fuzz
+from pcw_sim_bridge.can.trials import (
+    ALLOWED_MS,
+    DETECTED_BY_DRIVE_ALONE,
+    FAULT_TRIALS,
+    Rig,
+    fault_trial,
+    fuzz,
+)
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.simulated_robot import JointCommand
 
@@ -200,7 +207,7 @@ def homing_rig(protocol, method, mark=0.4, direction=1):
 
 @pytest.mark.parametrize(("protocol", "method"), [("cia402", "index"), ("odrive", "switch")])
 def test_homing_finds_the_same_zero_again_and_again(protocol, method):
-    """Three times from anywhere: what the joints read afterwards is the truth, to two counts of the encoder behind the gear."""
+    """Three times from anywhere: what the joints read afterwards is the truth, to two counts of the encoder."""
     rng = np.random.default_rng(7)
     for k in range(3):
         driven = homing_rig(protocol, method, direction=1 if k % 2 else -1)
@@ -435,7 +442,10 @@ def test_the_doctor_says_what_is_wrong():
 
 
 def test_faults_of_the_emulator_are_read_and_refused():
-    assert read_faults(["dead a_drive 3", "# none", "", "foreign can0 1.5 # soon"]) == [(1.5, "foreign", "can0"), (3.0, "dead", "a_drive")]
+    assert read_faults(["dead a_drive 3", "# none", "", "foreign can0 1.5 # soon"]) == [
+        (1.5, "foreign", "can0"),
+        (3.0, "dead", "a_drive"),
+    ]
     with pytest.raises(CanError, match="NAME WHERE SECONDS"):
         read_faults(["dead a_drive"])
     driven = rig()

@@ -70,7 +70,9 @@ class BusLoad:
             lines.append(
                 f"  {count:3} x {rate:7.1f} Hz x {frame_bits(size):3} bit ({size} byte) = {total / 1000:7.1f} kbit/s  {what}"
             )
-        lines.append(f"  sum {self.bits / 1000:.1f} kbit/s; allowed {self.allowed:.0%} = {self.allowed * self.bitrate / 1000:.1f}")
+        lines.append(
+            f"  sum {self.bits / 1000:.1f} kbit/s; allowed {self.allowed:.0%} = {self.allowed * self.bitrate / 1000:.1f}"
+        )
         return "\n".join(lines)
 
 

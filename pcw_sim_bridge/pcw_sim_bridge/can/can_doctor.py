@@ -22,8 +22,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the command line."""
     options = argparse.ArgumentParser(
         prog="can_doctor",
-        description="List buses and drives, check rates and latencies, and nudge one joint at a time at low torque to check signs "
-        "and gears. No driver may run. Exit 0 when all is well, 1 when something is wrong, 2 on bad input.",
+        description="List buses and drives, check rates and latencies, and nudge one joint at a time at low torque to check "
+        "signs and gears. No driver may run. Exit 0 when all is well, 1 when something is wrong, 2 on bad input.",
     )
     options.add_argument("--robot", default="thesis", help="robot file, or the name of a shipped robot (default: thesis)")
     options.add_argument("--can-file", default="thesis_cia402", help="file of the drives, or the name of a shipped one")

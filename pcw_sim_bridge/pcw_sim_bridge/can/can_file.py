@@ -45,7 +45,9 @@ class Timeouts:
     """How long silence may last. Torque is zero one period later at most."""
 
     command: float = quantity("s", "newest joint_commands; then the robot stops", default=0.04, minimum=0.005, maximum=1.0)
-    feedback: float = quantity("s", "newest position of a drive; then the robot stops", default=0.04, minimum=0.005, maximum=1.0)
+    feedback: float = quantity(
+        "s", "newest position of a drive; then the robot stops", default=0.04, minimum=0.005, maximum=1.0
+    )
     watchdog: float = quantity("s", "of the drives: without the computer for so long they stop", default=0.04, minimum=0.005,
                                maximum=1.0)  # fmt: skip
 
@@ -73,7 +75,7 @@ class DriveJoint:
     current_limit: float = quantity("A", "largest current of the motor", above=0.0, maximum=1e4)
     sign: float = quantity("1", "+1, or -1 where the drive counts against the motor of the robot file", default=1.0,
                            minimum=-1.0, maximum=1.0)  # fmt: skip
-    gear: float | None = quantity("1", "turns of the motor per turn of the joint; must be that of the robot file", default=None,
+    gear: float | None = quantity("1", "turns of the motor per turn of the joint; as in the robot file", default=None,
                                   minimum=-1e4, maximum=1e4)  # fmt: skip
     counts: float | None = quantity("counts/rev", "of the drive per turn of the motor; default: robot file", default=None,
                                     above=0.0, maximum=1e9)  # fmt: skip
@@ -186,7 +188,9 @@ def _check(read: CanFile, robot: RobotDescription) -> None:
 def _check_joint(joint: DriveJoint, where: str, read: CanFile, robot: RobotDescription) -> None:
     least, most = (1 if joint.protocol == "cia402" else 0), LARGEST_NODE_ID[joint.protocol]
     if joint.node_id != int(joint.node_id) or not least <= joint.node_id <= most:
-        raise DescriptionError(f"{where}.node_id", joint.node_id, f"allowed for {joint.protocol}: a whole number {least} to {most}")
+        raise DescriptionError(
+            f"{where}.node_id", joint.node_id, f"allowed for {joint.protocol}: a whole number {least} to {most}"
+        )
     if joint.protocol == "cia402" and joint.node_id == read.master_id:
         raise DescriptionError(f"{where}.node_id", joint.node_id, "it is the master_id; allowed: another one")
     if abs(joint.sign) != 1.0:
@@ -197,9 +201,13 @@ def _check_joint(joint: DriveJoint, where: str, read: CanFile, robot: RobotDescr
         raise DescriptionError(f"{where}.gear", joint.gear, f"allowed: {gear:.6g}, which {robot.name} says (or leave it out)")
     limit = robot.torque_limit[caster, axis]
     if joint.torque_limit is not None and joint.torque_limit > limit:
-        raise DescriptionError(f"{where}.torque_limit", joint.torque_limit, f"allowed: at most {limit:g} N m, of the robot file")
+        raise DescriptionError(
+            f"{where}.torque_limit", joint.torque_limit, f"allowed: at most {limit:g} N m, of the robot file"
+        )
     if joint.protocol == "cia402" and joint.rated_torque is None:
-        raise DescriptionError(f"{where}.rated_torque", None, "cia402 torques are per mille of it; allowed: object 0x6076 in N m")
+        raise DescriptionError(
+            f"{where}.rated_torque", None, "cia402 torques are per mille of it; allowed: object 0x6076 in N m"
+        )
     if joint.homing is not None:
         if axis != 1:
             raise DescriptionError(f"{where}.homing", joint.homing.method, "allowed: on steering axes alone")

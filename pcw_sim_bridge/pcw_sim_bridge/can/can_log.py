@@ -37,7 +37,9 @@ def parser() -> argparse.ArgumentParser:
         if action == "recording":
             sub.add_argument("--out", type=Path, required=True, metavar="BAG", help="folder to make")
         else:
-            sub.add_argument("--udp-port", type=int, default=0, metavar="PORT", help="buses as UDP multicast (default: file's)")
+            sub.add_argument(
+                "--udp-port", type=int, default=0, metavar="PORT", help="buses as UDP multicast (default: file's)"
+            )
         if action == "record":
             sub.add_argument("--duration", type=float, metavar="SECONDS", help="default: until interrupted")
     return options
@@ -75,7 +77,9 @@ def make_recording(log: Path, robot: RobotDescription, file: CanFile, out: Path)
     with RecordingWriter(out, flush_interval=None) as writer:
         write_joint_topics(writer, robot, decoder, frames_of_file(read_log(log), file))
         counts = dict(writer.counts)
-    said = ", ".join(f"{count} {topic.strip('/')}" for topic, count in counts.items()) or "nothing, as no set of joints was whole"
+    said = (
+        ", ".join(f"{count} {topic.strip('/')}" for topic, count in counts.items()) or "nothing, as no set of joints was whole"
+    )
     return f"{out}: {said}; {decoder.foreign} frames of nobody in {file.name}"
 
 

@@ -35,7 +35,7 @@ from .frame import ERROR_BUS_OFF, Arrived, Frame
 from .motor_map import MotorMap
 from .output_gate import OutputGate
 from .supervisor import DriveWatch, Fault
-from .transport import BusOff, Transport, TransmitBufferFull
+from .transport import BusOff, TransmitBufferFull, Transport
 
 ENABLE_TIME = 1.0  # in which all drives must have torque, or none keeps it [s]
 STILL = 0.05  # below this every joint stands still [rad/s]
@@ -200,9 +200,9 @@ class CanRobot:
             soonest = min(deadline for _, _, _, deadline, _ in waiting.values())
             wait = min(max(soonest - self.transport.now(), 0.0), master_heartbeat(self.file))
             for arrived in self.transport.receive(wait):
-                drive = self._handle(arrived)
-                if drive is not None and drive.name in waiting and waiting[drive.name][2].accept(arrived.frame):
-                    go_on(drive, waiting[drive.name][1], arrived.frame)
+                owner = self._handle(arrived)
+                if owner is not None and owner.name in waiting and waiting[owner.name][2].accept(arrived.frame):
+                    go_on(owner, waiting[owner.name][1], arrived.frame)
             now = self.transport.now()
             for name, (drive, procedure, ask, deadline, tries) in list(waiting.items()):
                 if now < deadline or waiting[name][2] is not ask:
@@ -233,7 +233,9 @@ class CanRobot:
             if self.faults:
                 raise CanError(f"torque is not allowed after {'; '.join(map(str, self.faults))}; allowed: clear_faults first")
             if self._homing:
-                raise CanError(f"torque is not allowed while {', '.join(self._homing)} look for their marks; allowed: afterwards")
+                raise CanError(
+                    f"torque is not allowed while {', '.join(self._homing)} look for their marks; allowed: afterwards"
+                )
             self._command, self._command_time, self._sent_in_cycle = None, None, False
             for drive in self.drives:
                 if drive.feedback.state is DriveState.ENABLED:
@@ -491,7 +493,7 @@ class CanRobot:
     def start_homing(self, names: Sequence[str] | None = None) -> None:
         """Let steering axes look for their marks, as their `homing` says; the periods do the rest.
 
-        `homing_results` then says how it ended: "attained", or why not. An axis with an absolute encoder has nothing to look for.
+        `homing_results` then says how it ended: "attained", or why not. An absolute encoder has nothing to look for.
 
         Raises:
             CanError: refused while torque is on, after a fault, or while anything moves; or an axis that has no homing.
@@ -508,7 +510,9 @@ class CanRobot:
         reading = self._reading
         if reading is None or np.abs(reading.joints.velocity).max() > STILL:
             fastest = np.inf if reading is None else float(np.abs(reading.joints.velocity).max())
-            raise CanError(f"homing at {fastest:.3g} rad/s is not allowed while moving; allowed: all joints below {STILL:g} rad/s")
+            raise CanError(
+                f"homing at {fastest:.3g} rad/s is not allowed while moving; allowed: all joints below {STILL:g} rad/s"
+            )
         self.homing_results = {}
         looking: dict[str, Homing] = {}
         procedures = []

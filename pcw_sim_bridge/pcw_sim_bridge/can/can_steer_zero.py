@@ -80,9 +80,7 @@ def measure(can: CanRobot, robot: RobotDescription, duration: float) -> SteerZer
     return estimate_steer_zeros(robot, np.array(positions), np.array(velocities))
 
 
-def calibrate(
-    can: CanRobot, robot: RobotDescription, duration: float, passes: int = 3
-) -> tuple[np.ndarray, list[SteerZeros]]:
+def calibrate(can: CanRobot, robot: RobotDescription, duration: float, passes: int = 3) -> tuple[np.ndarray, list[SteerZeros]]:
     """Measure, apply and measure again until nothing is left; returns the sum (n,) [rad] and what each pass found.
 
     Raises:

@@ -238,7 +238,9 @@ class Cia402Drive(Drive):
         yield from self._nmt(NMT_PRE_OPERATIONAL)
         device = yield from self._read(0x1000)
         if device & 0xFFFF != 402:
-            raise DriveError(f"{self.name}: device type 0x1000 = {device & 0xFFFF} is not allowed; allowed: 402, a CiA 402 drive")
+            raise DriveError(
+                f"{self.name}: device type 0x1000 = {device & 0xFFFF} is not allowed; allowed: 402, a CiA 402 drive"
+            )
         vendor = yield from self._read(0x1018, 1)
         product = yield from self._read(0x1018, 2)
         self.identity = f"vendor 0x{vendor:X}, product 0x{product:X}"
@@ -250,9 +252,13 @@ class Cia402Drive(Drive):
         yield from self._check_motor()
         yield from self._choose_mode()
         yield from self._write(0x1017, 0, round(self.heartbeat * 1000), 2)
-        yield from self._write(0x1016, 1, (self._master_id << 16) | round(self.watchdog * 1000), 4, "it does not watch this computer")
+        yield from self._write(
+            0x1016, 1, (self._master_id << 16) | round(self.watchdog * 1000), 4, "it does not watch this computer"
+        )
         yield from self._write(0x6007, 0, 1, 2, "it does not say what it does without this computer")
-        yield from self._write(0x6072, 0, _whole(self._largest_torque / self._torque_unit, 16), 2, "its torque limit is its own")
+        yield from self._write(
+            0x6072, 0, _whole(self._largest_torque / self._torque_unit, 16), 2, "its torque limit is its own"
+        )
         yield from self._write(0x6080, 0, math.ceil(self._largest_speed * 60.0 / math.tau), 4, "its speed limit is its own")
         for (mapping, base), objects in MAPPED.items():
             yield from self._map(mapping, base, objects)
@@ -273,7 +279,7 @@ class Cia402Drive(Drive):
         implied = rated / current if current else math.inf
         if abs(implied - self.joint.torque_constant) > 0.05 * self.joint.torque_constant:
             self.notes.append(
-                f"torque_constant is {self.joint.torque_constant:g} N m/A, the drive's rated torque over rated current {implied:.4g}"
+                f"torque_constant is {self.joint.torque_constant:g} N m/A, rated torque over rated current {implied:.4g}"
             )
 
     def _choose_mode(self) -> Generator[Ask, Frame | None, None]:
@@ -283,7 +289,7 @@ class Cia402Drive(Drive):
         fitting = [mode for mode in choices if supported >> MODE_BIT[mode] & 1]
         if not fitting:
             raise DriveError(
-                f"{self.name}: torque_mode {self.joint.torque_mode!r} is not allowed; allowed: what 0x6502 = 0x{supported:X} offers"
+                f"{self.name}: torque_mode {self.joint.torque_mode!r} is not allowed; allowed: 0x6502 = 0x{supported:X}"
             )
         self._torque_mode = fitting[0]
         if not supported >> MODE_BIT[PROFILE_VELOCITY] & 1:

@@ -49,7 +49,11 @@ class Finding:
 
 
 def examine(
-    robot: RobotDescription, file: CanFile, transport: Transport, nudge: bool = True, share: float = NUDGE_SHARE,
+    robot: RobotDescription,
+    file: CanFile,
+    transport: Transport,
+    nudge: bool = True,
+    share: float = NUDGE_SHARE,
     lifted: bool = False,
 ) -> Iterator[Finding]:
     """Look at everything, and yield what is found as it is found; no torque is left on.
@@ -168,7 +172,9 @@ def _judge(
             yield Finding(False, name, f"it stood still at {told}: a brake, a loose motor, or friction")
         return
     if gained < 0.0:
-        yield Finding(False, name, f"it turned against its torque, by {step:.3f} rad: the sign of its encoder or of its motor is wrong")
+        yield Finding(
+            False, name, f"it turned against its torque, by {step:.3f} rad: the sign of its encoder or of its motor is wrong"
+        )
         return
     yield Finding(True, name, f"it turned with its torque, by {step:.3f} rad at {told}")
     yield from _judge_gear(can, name, gained, share, lifted)
@@ -193,8 +199,10 @@ def _judge_gear(can: CanRobot, name: str, gained: float, share: float, lifted: b
     if ratio > INERTIA_FACTOR or (lifted and ratio < 1.0 / INERTIA_FACTOR):
         way = "more" if ratio > 1.0 else "less"
         yield Finding(
-            False, name, f"it gained {gained:.2f} rad/s where {free:.2f} rad/s are expected with the wheel off the ground, far "
-            f"{way}: gear, counts or torque constant are wrong",
+            False, name, f"it gained {gained:.2f} rad/s where {free:.2f} rad/s are expected with the wheel off the ground, "
+            f"far {way}: gear, counts or torque constant are wrong",
         )  # fmt: skip
     elif lifted:
-        yield Finding(True, name, f"it gained {gained:.2f} rad/s, {free:.2f} rad/s expected: gear, counts and torque constant fit")
+        yield Finding(
+            True, name, f"it gained {gained:.2f} rad/s, {free:.2f} rad/s expected: gear, counts and torque constant fit"
+        )

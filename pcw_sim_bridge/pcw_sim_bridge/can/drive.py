@@ -128,7 +128,7 @@ class Drive(ABC):
         self._was_enabled = False
 
     def _begins(self, want: Want) -> bool:
-        """Whether torque is wanted now and was not before. What the drive said until now is of before then, and is forgotten."""
+        """Whether torque is wanted now and was not before. What the drive said before is forgotten."""
         begins, self._was_enabled = want.enabled and not self._was_enabled, want.enabled
         if begins and self.feedback.state is DriveState.ENABLED:
             self.feedback.state = DriveState.DISABLED

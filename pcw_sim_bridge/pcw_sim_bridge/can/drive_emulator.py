@@ -29,7 +29,7 @@ from .can_file import UDP_PORT, on_udp, read_can_file
 from .emulated_drive import FAULTS
 from .emulated_robot import BUS_FAULTS, EmulatedRobot
 from .errors import CanError
-from .transport import BusOff, Transport, TransmitBufferFull
+from .transport import BusOff, TransmitBufferFull, Transport
 
 ZERO_TORQUE = 1e-9  # [N m]
 
@@ -39,8 +39,8 @@ def parser() -> argparse.ArgumentParser:
     faults = "\n".join(f"  {name:17} {what}" for name, what in {**FAULTS, **BUS_FAULTS}.items())
     options = argparse.ArgumentParser(
         prog="drive_emulator", formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Emulate the drives of a CAN file on a bus, with a plant behind them. On standard input: a fault and where, "
-        "`stats`, or `quit`.",
+        description="Emulate the drives of a CAN file on a bus, with a plant behind them. On standard input: a fault and "
+        "where, `stats`, or `quit`.",
         epilog=f"faults:\n{faults}\nexample: drive_emulator --fault 'dead rear_left_steer 12.5'",
     )  # fmt: skip
     options.add_argument("--robot", default="thesis", help="robot file, or the name of a shipped robot (default: thesis)")
@@ -54,7 +54,11 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--watchdog", type=float, metavar="SECONDS", help="set in the drives (default: that of the file)")
     options.add_argument("--lifted", action="store_true", help="the wheels are off the ground")
     options.add_argument(
-        "--fault", action="append", default=[], metavar="'NAME WHERE SECONDS'", help="a fault so long after the start; repeatable"
+        "--fault",
+        action="append",
+        default=[],
+        metavar="'NAME WHERE SECONDS'",
+        help="a fault so long after the start; repeatable",
     )
     options.add_argument("--faults", type=Path, metavar="FILE", help="a file of such lines")
     options.add_argument("--duration", type=float, metavar="SECONDS", help="end after so long (default: never)")
@@ -142,8 +146,13 @@ def read_faults(lines: Sequence[str]) -> list[tuple[float, str, str]]:
 
 
 def serve(
-    emulated: EmulatedRobot, transport: Transport, timer: FaultTimer, planned: list[tuple[float, str, str]],
-    asked: queue.Queue[str], duration: float | None, stopped: threading.Event,
+    emulated: EmulatedRobot,
+    transport: Transport,
+    timer: FaultTimer,
+    planned: list[tuple[float, str, str]],
+    asked: queue.Queue[str],
+    duration: float | None,
+    stopped: threading.Event,
 ) -> None:
     """Be the drives until `quit`, the end of the duration, or `stopped`."""
     dt = emulated.plant.dt

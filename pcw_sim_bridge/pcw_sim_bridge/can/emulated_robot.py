@@ -72,9 +72,7 @@ class EmulatedRobot:
         off_buses: buses that are cut.
     """
 
-    def __init__(
-        self, plant: Plant, file: CanFile, seed: int = 0, start: float = 0.0, watchdog: float | None = None
-    ) -> None:
+    def __init__(self, plant: Plant, file: CanFile, seed: int = 0, start: float = 0.0, watchdog: float | None = None) -> None:
         robot = plant.robot
         self.plant, self.robot, self.file = plant, robot, file
         self.start = self.time = start

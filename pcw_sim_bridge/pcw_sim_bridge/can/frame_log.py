@@ -1,9 +1,9 @@
 """Frames as a recording (INTERFACES, section 4): what the drives and the computer said to one another, as joint_states and
 joint_commands.
 
-A joint_states is written when every drive has said position and speed since the one before, stamped with the SYNC before it or,
-without SYNC, with the time of the oldest position. A joint_commands is written when every drive has been told something since
-the one before; it bears the stamp of the newest joint_states, as the driver's do.
+A joint_states is written when every drive has said position and speed since the one before, stamped with the SYNC before it
+or, without SYNC, with the time of the oldest position. A joint_commands is written when every drive has been told something
+since the one before; it bears the stamp of the newest joint_states, as a controller's do.
 """
 
 from __future__ import annotations
@@ -118,7 +118,10 @@ class FrameDecoder:
 
 
 def write_joint_topics(
-    writer: RecordingWriter, robot: RobotDescription, decoder: FrameDecoder, frames: Iterable[tuple[str, Frame, float]],
+    writer: RecordingWriter,
+    robot: RobotDescription,
+    decoder: FrameDecoder,
+    frames: Iterable[tuple[str, Frame, float]],
     offset_ns: int = 0,
 ) -> None:
     """Write the joint topics of frames to an open recording; `offset_ns` is added to all times [ns]."""
@@ -134,9 +137,7 @@ def write_joint_topics(
             writer.write("/joint_commands", message, round(time * 1e9) + offset_ns)
 
 
-def frames_of_file(
-    frames: Iterable[tuple[str, Frame, float]], file: CanFile
-) -> Iterator[tuple[str, Frame, float]]:
+def frames_of_file(frames: Iterable[tuple[str, Frame, float]], file: CanFile) -> Iterator[tuple[str, Frame, float]]:
     """Give every frame of a log the name that its bus has in the file.
 
     Logs know buses by number or by the name of an interface: the name, the channel, or the only bus there is; else by number

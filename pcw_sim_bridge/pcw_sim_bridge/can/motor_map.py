@@ -28,7 +28,7 @@ class MotorMap:
             self.sign[joint_place(robot, joint.name)] = joint.sign
         self.zero = zeros(file, robot)
         self._gear = robot.gear_matrix
-        self._inverse = np.linalg.inv(robot.gear_matrix)
+        self._inverse: FloatArray = np.linalg.inv(robot.gear_matrix).astype(np.float64)
         self._inverse_transposed = np.transpose(self._inverse, (0, 2, 1)).copy()
         self._transposed = np.transpose(self._gear, (0, 2, 1)).copy()
 

@@ -2,9 +2,9 @@
 
 An identifier is the node id times 32 plus a command; `cansimple.dbc` describes the frames that are used here. It is read by
 `cantools`; since decoding a frame there takes some 20 us, the layouts of the frames that come and go in each period are taken
-from it once (`Layout`). Positions and currents come by themselves, at periods that are set in the drive (`encoder_msg_rate_ms`,
-`iq_msg_rate_ms`, `heartbeat_msg_rate_ms`, `temperature_msg_rate_ms`); its watchdog (`watchdog_timeout`) is fed by the
-torques and velocities it is sent.
+from it once (`Layout`). Positions and currents come by themselves, at periods that are set in the drive
+(`encoder_msg_rate_ms`, `iq_msg_rate_ms`, `heartbeat_msg_rate_ms`, `temperature_msg_rate_ms`); its watchdog
+(`watchdog_timeout`) is fed by the torques and velocities it is sent.
 """
 
 from __future__ import annotations
@@ -188,7 +188,9 @@ class ODriveDrive(Drive):
             self.feedback.state = DriveState.FAULT
         else:
             self.feedback.error_names = ()
-            self.feedback.state = DriveState.ENABLED if state in (CLOSED_LOOP, HOMING, ENCODER_INDEX_SEARCH) else DriveState.DISABLED
+            self.feedback.state = (
+                DriveState.ENABLED if state in (CLOSED_LOOP, HOMING, ENCODER_INDEX_SEARCH) else DriveState.DISABLED
+            )
         if self._homing_asked and self.feedback.homing == "busy":
             if state == self._homing_state:
                 self._homing_began = True
@@ -262,7 +264,9 @@ class ODriveDrive(Drive):
         answer = yield self._ask("Get_Version")
         values = None if answer is None else layout("Get_Version").unpack(answer.data)
         if values is None:
-            raise DriveError(f"{self.name}: Get_Version has no answer; allowed: a drive that is on, on this bus, with this node id")
+            raise DriveError(
+                f"{self.name}: Get_Version has no answer; allowed: a drive that is on, on this bus, with this node id"
+            )
         self.identity = f"hardware {values[1]}.{values[2]} variant {values[3]}"
         self.firmware = f"{values[4]}.{values[5]}.{values[6]}"
         if values[4] == 0 and values[5] < 6:
@@ -300,9 +304,7 @@ class ODriveDrive(Drive):
 
     def _ask(self, message: str) -> Ask:
         identifier = self.node_id << 5 | layout(message).command
-        return Ask(
-            Frame(identifier, b"", remote=True), lambda frame: frame.id == identifier and len(frame.data) == 8, message
-        )
+        return Ask(Frame(identifier, b"", remote=True), lambda frame: frame.id == identifier and len(frame.data) == 8, message)
 
     def _wait(self, command: int, what: str, timeout: float) -> Ask:
         identifier = self.node_id << 5 | command

@@ -29,8 +29,14 @@ START_NS = 1_000_000_000
 
 
 def record_run_over_can(
-    robot: RobotDescription, file: CanFile, commanded_twist: Callable[[float], FloatArray | None], duration: float, seed: int,
-    path: str | Path, controlled_as: RobotDescription | None = None, controller_name: str = "computed_torque",
+    robot: RobotDescription,
+    file: CanFile,
+    commanded_twist: Callable[[float], FloatArray | None],
+    duration: float,
+    seed: int,
+    path: str | Path,
+    controlled_as: RobotDescription | None = None,
+    controller_name: str = "computed_torque",
 ) -> None:
     """Drive a robot over emulated CAN and write the recording; see `simulated_run.record_run` for the arguments.
 

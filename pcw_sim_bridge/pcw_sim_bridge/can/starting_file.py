@@ -1,4 +1,4 @@
-"""A CAN file to begin with, for any robot: node ids in the order of the joints, and motors that just reach the robot's limits."""
+"""A CAN file to begin with, for any robot: node ids in the order of the joints, and motors that reach the robot's limits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TORQUE_CONSTANT = 0.05  # [N m/A], of a motor of some 100 W
 def starting_content(robot: RobotDescription, protocol: str = "cia402", **changes: Any) -> dict[str, Any]:
     """Return what such a file holds, on one bus; `changes` replace keys at the top.
 
-    Torque constant, rated torque and current limit are no more than consistent: they are to be replaced by those of the drives.
+    Torque constant, rated torque and current limit are no more than consistent: those of the drives are to replace them.
     """
     inverse_transposed = np.transpose(np.linalg.inv(robot.gear_matrix), (0, 2, 1))
     most = float((np.abs(inverse_transposed) @ robot.torque_limit[:, :, None]).max())

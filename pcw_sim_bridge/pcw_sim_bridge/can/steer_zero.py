@@ -1,7 +1,7 @@
 """Zeros of the steering axes from a motion: the headings with which wheels that roll agree on how the robot moves.
 
-With headings q - delta of measured angles q, A(q - delta) V = B q_dot (3.24) holds for one twist V at each instant. The offsets
-minimise what no twist explains,
+With headings q - delta of measured angles q, A(q - delta) V = B q_dot (3.24) holds for one twist V at each instant. The
+offsets minimise what no twist explains,
 
     sum_k | (I - A_k A_k^+) B q_dot_k |^2,     A_k = A(q_k - delta),
 
@@ -63,12 +63,12 @@ def estimate_steer_zeros(robot: RobotDescription, position: FloatArray, velocity
     sensed = np.einsum("nij,tnj->tni", joint_matrix_blocks(robot), velocity)
     speed = float(np.abs(sensed).mean()) if len(sensed) else 0.0
     if len(sensed) < 100 or speed < SLOWEST:
-        raise CanError(f"motion of {len(sensed)} readings at {speed:.3g} m/s is not allowed; allowed: at least 100, {SLOWEST:g} m/s")
+        raise CanError(
+            f"motion of {len(sensed)} readings at {speed:.3g} m/s is not allowed; allowed: at least 100, {SLOWEST:g} m/s"
+        )
     angle = position[:, :, STEER]
     best = _fit(robot, angle, sensed, np.zeros(robot.n))
-    parts = [
-        _fit(robot, angle[part], sensed[part], best) for part in np.array_split(np.arange(len(angle)), BLOCKS)
-    ]
+    parts = [_fit(robot, angle[part], sensed[part], best) for part in np.array_split(np.arange(len(angle)), BLOCKS)]
     sigma = np.std(parts, axis=0, ddof=1) / math.sqrt(BLOCKS)
     if not np.isfinite(best).all() or np.abs(best).max() > LARGEST_OFFSET:
         raise CanError(f"offsets {np.round(best, 3).tolist()} rad are not allowed; allowed: below {LARGEST_OFFSET:g} rad")

@@ -87,7 +87,9 @@ class DriveWatch:
         found: list[Fault] = []
         age = now - feedback.position_time
         if age > self._timeout:
-            said = f"no position for {age * 1000:.0f} ms, allowed {self._timeout * 1000:.0f} ms" if age < 1e6 else "never heard"
+            said = (
+                f"no position for {age * 1000:.0f} ms, allowed {self._timeout * 1000:.0f} ms" if age < 1e6 else "never heard"
+            )
             return [Fault("missing_node", drive.name, said)]
         if feedback.restarted:
             return [Fault("node_reset", drive.name, "the drive has started anew or is no longer operational")]

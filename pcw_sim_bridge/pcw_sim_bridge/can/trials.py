@@ -6,8 +6,8 @@
     python -m pcw_sim_bridge.can.trials loads
 
 Every torque and every reading is a frame on the way between the driver's core and emulated drives. Time is simulated, so that
-the times to zero torque are those of the design, and not of the computer that this runs on; `nodes.can_trials` has the same stack
-in real time.
+the times to zero torque are those of the design, and not of the computer that this runs on; `nodes.can_trials` has the same
+stack in real time.
 """
 
 from __future__ import annotations
@@ -170,7 +170,9 @@ def run_faults(times: int, seed: int) -> tuple[str, bool]:
             fine = fine and good
             worst = "never" if None in zeros else f"{max(zeros):5.1f} ms"
             mean = "" if None in zeros else f"{np.mean(zeros):5.1f} ms"
-            lines.append(f"{name:14} {fault:21} {times:5} {mean:>8} {worst:>8}  {named:5}  {stays:9}{'' if good else '  NOT MET'}")
+            lines.append(
+                f"{name:14} {fault:21} {times:5} {mean:>8} {worst:>8}  {named:5}  {stays:9}{'' if good else '  NOT MET'}"
+            )
     return "\n".join(lines), fine
 
 
@@ -194,19 +196,21 @@ def random_frame(rng: np.random.Generator, seen: Sequence[Frame]) -> Frame:
                 data = (data + bytes(rng.integers(0, 256, 8, dtype=np.uint8)))[: int(rng.integers(0, 9))]
         identifier = base.id ^ (1 << int(rng.integers(11)) if rng.random() < 0.2 else 0)
         return base._replace(id=identifier, data=bytes(data), remote=bool(rng.random() < 0.05))
-    data = bytes(rng.integers(0, 256, int(rng.integers(0, 9)), dtype=np.uint8))
+    anything = bytes(rng.integers(0, 256, int(rng.integers(0, 9)), dtype=np.uint8))
     extended = bool(rng.random() < 0.05)
-    return Frame(int(rng.integers(1 << (29 if extended else 11))), data, bool(rng.random() < 0.05), False, extended)
+    return Frame(int(rng.integers(1 << (29 if extended else 11))), anything, bool(rng.random() < 0.05), False, extended)
 
 
 def run_fuzz(count: int, seed: int) -> tuple[str, bool]:
-    """Throw frames at the driver's core, without torque and with it, and at the drives; returns a table and whether all held."""
+    """Throw frames at the driver's core, without torque and with it, and at drives; returns a table and whether all held."""
     robot, lines, fine = load_robot("thesis"), [], True
     for name in FILES:
         rng = np.random.default_rng(seed)
         file = read_can_file(name, robot)
         outcome = fuzz(robot, file, count // (2 * len(FILES)), rng)
-        fine = fine and outcome["torque_without_command"] == 0 and outcome["beyond_limits"] == 0 and outcome["works_afterwards"]
+        fine = (
+            fine and outcome["torque_without_command"] == 0 and outcome["beyond_limits"] == 0 and outcome["works_afterwards"]
+        )
         lines.append(f"{name:14} " + ", ".join(f"{key} {value}" for key, value in outcome.items()))
     return "\n".join(lines), fine
 
@@ -295,7 +299,7 @@ VERDICT_CASES = (("healthy", ""), ("friction", "{name: drive_coulomb_friction, t
 
 
 def run_verdict(out: Path, seed: int, can_file: str = FILES[0]) -> tuple[str, bool]:
-    """Analyse recordings over CAN and of the bridge's robot, with an effect and without; returns a table and whether they agree."""
+    """Analyse recordings over CAN and of the bridge's robot, healthy and not; returns a table and whether they agree."""
     from ..mismatch.__main__ import main as mismatch
 
     believed = load_robot("thesis")

@@ -8,7 +8,9 @@ import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 
+from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -78,6 +80,17 @@ class CanDriverNode(LifecycleNode):
             self.trigger_activate()
 
     # --- Lifecycle ---------------------------------------------------------------------------------------
+
+    def _LifecycleNodeMixin__on_change_state(  # noqa: N802 - the name that rclpy calls
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        """Refuse a transition that the state does not have: rclpy of Jazzy lets such a request end the node."""
+        try:
+            return super()._LifecycleNodeMixin__on_change_state(request, response)
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().error(f"transition refused: {error}")
+            response.success = False
+            return response
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Open the buses and set up every drive."""

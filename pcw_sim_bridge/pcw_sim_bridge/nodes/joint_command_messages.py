@@ -16,8 +16,8 @@ def read_joint_command(message: JointState, joint_index: Mapping[str, int], shap
     """Return the command of a message.
 
     Raises:
-        PlantError: a joint missing, unknown or named twice, a field of another length, both or none of effort and velocity, NaN
-            or infinity.
+        PlantError: a joint missing, unknown or named twice, a field of another length, both or none of effort and velocity,
+            NaN or infinity.
     """
     if set(message.name) != set(joint_index) or len(message.name) != len(joint_index):
         raise PlantError(f"joint command for {list(message.name)}; allowed: each of {list(joint_index)} once")
@@ -26,6 +26,4 @@ def read_joint_command(message: JointState, joint_index: Mapping[str, int], shap
         if count not in (0, len(message.name)):
             raise PlantError(f"joint command: {count} values of {field}; allowed: one a joint, or none")
     _, velocity, effort = joint_state_arrays(message, joint_index, shape)
-    return JointCommand(
-        effort=effort if len(message.effort) else None, velocity=velocity if len(message.velocity) else None
-    )
+    return JointCommand(effort=effort if len(message.effort) else None, velocity=velocity if len(message.velocity) else None)
