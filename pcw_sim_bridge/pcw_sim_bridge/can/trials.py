@@ -36,6 +36,7 @@ from .can_robot import CanRobot, TimedReading
 from .drive_emulator import FaultTimer
 from .drive_set import bus_loads, make_drives
 from .emulated_robot import EmulatedRobot, EmulatedTransport
+from .errors import CanError
 from .frame import Arrived, Frame
 from .simulated_can_run import record_run_over_can
 from .transport import TransmitBufferFull
@@ -348,6 +349,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for action in ("faults", "fuzz", "verdict", "loads"):
         sub = actions.add_parser(action)
         sub.add_argument("--seed", type=int, default=0)
+        sub.add_argument("--into", type=Path, metavar="PAGE", help="write the table into a page, between its marks")
         if action == "faults":
             sub.add_argument("--times", type=int, default=20, help="each fault, with each protocol (default: 20)")
         elif action == "fuzz":
@@ -357,9 +359,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = options.parse_args(arguments)
     try:
         if given.action == "loads":
-            print(run_loads())
-            return 0
-        if given.action == "faults":
+            said, fine = run_loads(), True
+        elif given.action == "faults":
             said, fine = run_faults(given.times, given.seed)
         elif given.action == "fuzz":
             said, fine = run_fuzz(given.frames, given.seed)
@@ -369,7 +370,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"can.trials: {error}", file=sys.stderr)
         return 2
     print(said)
+    if given.into is not None:
+        _write_into(given.into, given.action, said)
     return 0 if fine else 1
+
+
+def _write_into(page: Path, mark: str, table: str) -> None:
+    """Replace what stands between `<!-- MARK -->` and `<!-- /MARK -->` of a page."""
+    head, opening, rest = page.read_text(encoding="utf-8").partition(f"<!-- {mark} -->\n")
+    _, closing, tail = rest.partition(f"<!-- /{mark} -->")
+    if not opening or not closing:
+        raise CanError(f"--into {page} is not allowed; allowed: a page with the marks <!-- {mark} --> and <!-- /{mark} -->")
+    indented = "\n".join(f"    {line}".rstrip() for line in table.splitlines())
+    page.write_text(f"{head}{opening}{indented}\n{closing}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":
