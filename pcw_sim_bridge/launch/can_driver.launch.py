@@ -35,7 +35,8 @@ def generate_launch_description() -> LaunchDescription:
         [
             *(DeclareLaunchArgument(name, default_value=default, description=what) for name, default, what in ARGUMENTS),
             Node(
-                package="pcw_sim_bridge", executable="drive_emulator", output="screen", condition=IfCondition(value["emulate"]),
+                package="pcw_sim_bridge", executable="drive_emulator", output="screen",
+                condition=IfCondition(value["emulate"]),
                 arguments=["--robot", value["robot"], "--can-file", value["can_file"], "--udp-port", value["udp_port"]],
             ),
             Node(package="pcw_sim_bridge", executable="can_driver", output="screen", parameters=[parameters]),

@@ -15,6 +15,7 @@ from pcw_sim_bridge.can.drive_emulator import read_faults
 from pcw_sim_bridge.can.emulated_robot import EmulatedRobot, EmulatedTransport
 from pcw_sim_bridge.can.errors import CanError
 from pcw_sim_bridge.can.frame import ERROR_BUS_OFF, Arrived, Frame
+from pcw_sim_bridge.can.simulated_can_run import record_run_over_can
 from pcw_sim_bridge.can.starting_file import starting_content, with_joints
 from pcw_sim_bridge.can.steer_zero import estimate_steer_zeros, write_zeros
 from pcw_sim_bridge.can.trials import (
@@ -27,6 +28,7 @@ from pcw_sim_bridge.can.trials import (
 )
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.simulated_robot import JointCommand
+from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
 PROTOCOLS = ("cia402", "odrive")
@@ -387,6 +389,24 @@ def test_a_log_that_is_none_is_refused(tmp_path):
     (tmp_path / "x.blf").write_bytes(b"no")
     with pytest.raises(CanError, match="cannot be read"):
         list(read_log(tmp_path / "x.blf"))
+
+
+def test_a_run_over_can_leaves_the_recording_that_the_bridge_would(tmp_path):
+    file = read_can_file("thesis_cia402", THESIS)
+    record_run_over_can(THESIS, file, lambda time: np.array([0.2 * np.sin(3.0 * time), 0.0, 0.1]), 1.5, 1, tmp_path / "can")
+    record_run(THESIS, lambda time: np.array([0.2 * np.sin(3.0 * time), 0.0, 0.1]), 1.5, 1, tmp_path / "bridge")
+    over_can, bridged = (Recording.open(tmp_path / name, THESIS) for name in ("can", "bridge"))
+    assert [str(warning) for warning in over_can.warnings] == [str(warning) for warning in bridged.warnings]
+    assert len(over_can.joint_states) == pytest.approx(375, abs=3) and len(bridged.joint_states) == pytest.approx(750, abs=3)
+    assert len(over_can.imu) == pytest.approx(len(bridged.imu), abs=2)
+    assert over_can.ground_truth.pose[-1] == pytest.approx(bridged.ground_truth.pose[-1], abs=0.01)
+    assert over_can.cmd_vel is not None and np.abs(over_can.joint_commands.effort).max() > 0.1
+
+
+@pytest.mark.nightly
+def test_the_analyser_gives_the_same_verdicts_over_can(tmp_path):
+    said, same = run_verdict(tmp_path, 3)
+    assert same, said
 
 
 # --- The doctor --------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 import threading
 import time
 import traceback
@@ -28,12 +30,14 @@ from pcw_description.nodes.node_tools import (
 )
 
 from ..can.can_file import on_udp, read_can_file
-from ..can.can_robot import CanRobot, TimedReading
+from ..can.can_robot import ENABLE_TIME, CanRobot, TimedReading
 from ..can.python_can import PythonCanTransport
 from ..can.supervisor import Fault
 from .joint_command_messages import read_joint_command
 
 READINGS_REMEMBERED = 32  # whose commands may still come
+# A callback that computes keeps the thread of the bus waiting for at most so long; Python's own 5 ms exceed a period [s].
+SWITCH_INTERVAL = 5e-4
 SETTLING = 0.2  # in which drives say that they are off [s]
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -107,6 +111,9 @@ class CanDriverNode(LifecycleNode):
                 self.get_logger().warning(f"{drive.name}: {note}")
         for load in self._can.loads.values():
             self.get_logger().info(load.arithmetic())
+        # What is there now stays: the collector need not look through it in the middle of a period, which takes tens of ms.
+        gc.collect()
+        gc.freeze()
         self._states = self.create_publisher(JointState, "joint_states", SENSOR_STREAM_SOURCE)
         self._commands = self.create_subscription(JointState, "joint_commands", self._on_command, COMMAND)
         self._start_cycles()
@@ -120,10 +127,12 @@ class CanDriverNode(LifecycleNode):
         except PcwError as error:
             self.get_logger().error(f"not activated: {error}")
             return FAILURE
-        while self._can.state == "enabling":
+        end = time.monotonic() + ENABLE_TIME + SETTLING
+        while self._can.state == "enabling" and time.monotonic() < end:
             time.sleep(0.002)
         if not self._can.armed:
-            self.get_logger().error(f"not activated: {'; '.join(map(str, self._can.faults))}")
+            self._can.request_disable()
+            self.get_logger().error(f"not activated: {'; '.join(map(str, self._can.faults)) or 'no torque in time'}")
             return FAILURE
         self._active = True
         return super().on_activate(state)
@@ -199,6 +208,7 @@ class CanDriverNode(LifecycleNode):
             except Exception as error:
                 self.get_logger().error(traceback.format_exc())
                 can.stop([Fault("exception", "can_driver", f"{type(error).__name__}: {error}")])
+                time.sleep(can.period)  # what fails at once shall not fail a thousand times a second
 
     def _publish(self, reading: TimedReading) -> None:
         age = time.monotonic() - reading.time
@@ -324,6 +334,7 @@ class _NoTransport:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the driver."""
+    sys.setswitchinterval(SWITCH_INTERVAL)
     return run_node(CanDriverNode, args)
 
 

@@ -3,7 +3,7 @@
     python -m pcw_sim_bridge.nodes.can_trials closed_loop [--can-file FILE] [--rate 250] [--duration 600]
     python -m pcw_sim_bridge.nodes.can_trials kill [--times 5]
 
-Reported as measured, with the load of the computer: a computer that is busy with other work is late, and drives rightly stop then.
+Reported as measured, with the load of the computer: one that is busy with other work is late, and drives rightly stop then.
 `--timeouts` sets all three timeouts of the file, so that ages can be measured where the file's own would end the run.
 """
 
@@ -101,7 +101,8 @@ class Stack:
     def drive_for(self, duration: float) -> None:
         """Drive for so long [s]."""
         begun = self.ros.peer.get_clock().now().nanoseconds
-        self.ros.spin_for(duration, lambda: self.move((self.ros.peer.get_clock().now().nanoseconds - begun) * 1e-9), every=0.05)
+        clock = self.ros.peer.get_clock()
+        self.ros.spin_for(duration, lambda: self.move((clock.now().nanoseconds - begun) * 1e-9), every=0.05)
 
 
 def closed_loop(options: argparse.Namespace) -> int:
@@ -117,15 +118,17 @@ def closed_loop(options: argparse.Namespace) -> int:
         measured = json.loads(stack.stats.read_text(encoding="utf-8"))
         said = next((line for line in stack.driver.log.splitlines() if "frames sent" in line), "")
     ages = measured["command_age_ms"]
-    sent, received = (int(said.split(word)[1].split()[0].strip(",;")) if said else -1 for word in ("frames sent ", "received "))
+    sent, received = (
+        int(said.split(word)[1].split()[0].strip(",;")) if said else -1 for word in ("frames sent ", "received ")
+    )
     to_drives, from_drives = measured["transport"]["received"], measured["transport"]["sent"]
     print(f"{options.can_file} at {options.rate:g} Hz for {options.duration:g} s; load of the computer {before:.1f} before, "
           f"{os.getloadavg()[0]:.1f} after, on {os.cpu_count()} cores")  # fmt: skip
     print(f"state of the driver at the end: {message}")
     print(f"age of the command at the drives: p50 {ages['p50']:.1f}, p99 {ages['p99']:.1f}, p99.9 {ages['p99.9']:.1f}, "
           f"largest {ages['largest']:.1f} ms")  # fmt: skip
-    print("from reading to command, at the driver: " + ", ".join(
-        f"{key.removeprefix('command_age_ms_')} {float(value):.2f} ms" for key, value in values.items() if "command_age" in key))
+    at_driver = {key.removeprefix("command_age_ms_"): float(value) for key, value in values.items() if "command_age" in key}
+    print("from reading to command, at the driver: " + ", ".join(f"{key} {age:.2f} ms" for key, age in at_driver.items()))
     print(f"frames to the drives: {sent} sent, {sum(to_drives.values())} received")
     print(f"frames from the drives: {sum(from_drives.values())} sent, {received} received (the emulator begins first)")
     print(f"cycles {values.get('cycles')}, late {values.get('late_cycles')}, incomplete {values.get('incomplete')}")
