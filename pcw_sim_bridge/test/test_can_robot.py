@@ -25,6 +25,7 @@ from pcw_sim_bridge.can.trials import (
     Rig,
     fault_trial,
     fuzz,
+    run_verdict,
 )
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.simulated_robot import JointCommand
