@@ -24,7 +24,8 @@ from .drive import Drive, DriveState, Feedback
 
 CURRENT_MARGIN = 1.2
 TORQUE_MARGIN = 1.25
-# What the computer does not know of when a position was read, for one period and over several [s].
+# What the computer does not know of when a position was read [s]; more when positions come at uneven times, as to a computer
+# that is busy.
 TIME_UNCERTAINTY = 0.010
 # Of `encoder_jump`, what may stand between position and integrated speed: it grows slowly, so that less of it is by chance.
 DRIFT_SHARE = 0.2
@@ -72,6 +73,7 @@ class DriveWatch:
     def forget(self) -> None:
         """Start afresh, as after homing: the next position is compared with none."""
         self._drift, self._seen, self._too_much, self._too_strong = 0.0, -math.inf, 0, 0
+        self._late = 0.0  # by how much positions came at other times than each period, of late [s]
         self._fresh = True
 
     def look(self, now: float, armed: bool, joint_torque: float, watch_encoder: bool = True) -> list[Fault]:
@@ -123,18 +125,21 @@ class DriveWatch:
     def _look_at_position(self, feedback: Feedback) -> list[Fault]:
         dt = feedback.position_time - feedback.previous_time
         if self._fresh or not 0.0 < dt < 1.0 or not math.isfinite(feedback.previous_velocity):
-            self._fresh, self._drift = False, 0.0
+            self._fresh, self._drift, self._late = False, 0.0, 0.0
             return []
         speed = 0.5 * (feedback.velocity + feedback.previous_velocity)
         step = feedback.position - feedback.previous_position - speed * dt
         fastest = max(abs(feedback.velocity), abs(feedback.previous_velocity))
-        allowed = self._jump + fastest * TIME_UNCERTAINTY
+        decay = math.exp(-dt / DRIFT_TIME)
+        self._late = max(self._late * decay, abs(dt - 1.0 / self.drive.rate))
+        uncertain = TIME_UNCERTAINTY + self._late
+        allowed = self._jump + fastest * uncertain
         name, to_joint = self.drive.name, 1.0 / self._gear
         if abs(step) > allowed:
             detail = f"a step of {step * to_joint:.3f} rad beyond what the speed makes, allowed {allowed * to_joint:.3f} rad"
             return [Fault("encoder_jump", name, detail)]
-        self._drift = self._drift * math.exp(-dt / DRIFT_TIME) + step
-        allowed = DRIFT_SHARE * self._jump + 2.0 * fastest * TIME_UNCERTAINTY
+        self._drift = self._drift * decay + step
+        allowed = DRIFT_SHARE * self._jump + 2.0 * fastest * uncertain
         if abs(self._drift) > allowed:
             detail = f"{self._drift * to_joint:.3f} rad between position and speed, allowed {allowed * to_joint:.3f} rad"
             return [Fault("encoder_stuck", name, detail)]
