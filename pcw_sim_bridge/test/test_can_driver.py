@@ -147,6 +147,7 @@ def test_a_killed_driver_and_a_killed_emulator_leave_the_others_safe_and_start_a
     ros.wait_for(lambda: stack.states and stack.torques().min() > 0.5)
 
 
+@pytest.mark.nightly
 def test_without_drives_it_is_not_configured_and_says_which_are_missing(ros, tmp_path):
     stack = Stack(ros, tmp_path, "cia402")
     stack.emulator.interrupt()

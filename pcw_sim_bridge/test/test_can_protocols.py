@@ -302,7 +302,7 @@ def test_an_odrive_goes_through_its_states():
 
 
 @pytest.mark.parametrize("protocol", ["cia402", "odrive"])
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(st.data())
 def test_no_frame_crashes_a_drive_or_makes_its_numbers_nan(protocol, data):
     drive = make_drives(THESIS, made(protocol))[0]
