@@ -230,6 +230,8 @@ def test_a_counter_that_wraps_is_followed(count, change):
 @given(st.integers(-(2**31), 2**31 - 1), st.integers(-32768, 32767), st.integers(-(2**31), 2**31 - 1))
 def test_pdos_come_out_as_they_went_in(count, torque, velocity):
     drive = Cia402Drive(made().joints[0], 250.0, 0.02, 0.04, 4096, 127, 0.75, 100.0)
+    [frame] = drive.output(Want(True, Mode.TORQUE, 0.1234), 1.0)
+    assert frame.data[:4] == b"\x06\x00\x00\x00"  # the first step towards torque, with none
     drive.receive(Frame(0x181, struct.pack("<Hih", 0x0627, count, torque)), 1.0)
     drive.receive(Frame(0x281, struct.pack("<ibH", velocity, 10, 0)), 1.0)
     assert drive.feedback.position == pytest.approx(count / 4096 * 2 * np.pi)
