@@ -6,6 +6,7 @@ import contextlib
 import errno
 import selectors
 import struct
+import threading
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -105,6 +106,8 @@ class PythonCanTransport:
     def send(self, bus: str, frame: Frame) -> None:
         """Send a frame without waiting; see `Transport`."""
         message = to_message(frame)
+        if bus in self._echoes:  # before it is sent: another thread may have its echo before this one goes on
+            self._echoes[bus].sent(frame, time.monotonic())
         try:
             self._buses[bus].send(message, timeout=0.0)
         except can.CanError as error:
@@ -120,8 +123,6 @@ class PythonCanTransport:
                 raise TransmitBufferFull(f"{bus}: {error}") from error
             raise BusOff(f"{bus}: {error}") from error
         self.sent[bus] += 1
-        if bus in self._echoes:
-            self._echoes[bus].sent(frame, time.monotonic())
         if self._log is not None:
             self._log.write(bus, frame, time.time(), sent=True)
 
@@ -179,9 +180,14 @@ class Echoes:
     def __init__(self) -> None:
         self._sent: deque[tuple[float, Frame]] = deque()
         self._expected: Counter[Frame] = Counter()
+        self._lock = threading.Lock()
 
     def sent(self, frame: Frame, now: float) -> None:
         """Expect the echo of a frame."""
+        with self._lock:
+            self._expect(frame, now)
+
+    def _expect(self, frame: Frame, now: float) -> None:
         while self._sent and now - self._sent[0][0] > self.LONGEST:
             old = self._sent.popleft()[1]
             if self._expected[old] > 1:
@@ -193,17 +199,18 @@ class Echoes:
 
     def is_own(self, frame: Frame, now: float) -> bool:
         """Whether a frame is an echo that was expected; each is expected once."""
-        if not self._expected.get(frame):
-            return False
-        self._expected[frame] -= 1
-        if not self._expected[frame]:
-            del self._expected[frame]
-        # Echoes come in the order of sending, so its entry is near the front.
-        for i, (_, sent) in enumerate(self._sent):
-            if sent == frame:
-                del self._sent[i]
-                break
-        return True
+        with self._lock:
+            if not self._expected.get(frame):
+                return False
+            self._expected[frame] -= 1
+            if not self._expected[frame]:
+                del self._expected[frame]
+            # Echoes come in the order of sending, so its entry is near the front.
+            for i, (_, sent) in enumerate(self._sent):
+                if sent == frame:
+                    del self._sent[i]
+                    break
+            return True
 
 
 class FrameLogWriter:
