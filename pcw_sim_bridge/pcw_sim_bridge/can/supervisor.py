@@ -12,7 +12,7 @@
 
 A step of position of a motor is explained if it is within `encoder_jump` times the gear, plus what the speed makes of the
 uncertainty of when it was read, of the mean of the speeds before and after times the time between. A standing encoder is so
-found 20 ms plus 0.2 `encoder_jump` over the speed after it stopped: within 50 ms above 1 rad/s of the joint by default.
+found 20 ms plus 0.2 `encoder_jump` over the speed after it stopped: within 50 ms above 1.5 rad/s of the joint by default.
 """
 
 from __future__ import annotations
