@@ -21,7 +21,7 @@ setup(
     name=package_name,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*", "tests", "tests.*"]),
-    package_data={"": ["*.css", "*.html", "*.j2", "*.js", "*.svg", "*.yaml", "py.typed"]},
+    package_data={"": ["*.css", "*.dbc", "*.html", "*.j2", "*.js", "*.svg", "*.yaml", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/" + package_name]),
         ("share/" + package_name, ["package.xml"]),
@@ -46,6 +46,11 @@ setup(
     entry_points={
         "console_scripts": [
             "bridge = pcw_sim_bridge.nodes.bridge:main",
+            "can_doctor = pcw_sim_bridge.can.can_doctor:main",
+            "can_driver = pcw_sim_bridge.nodes.can_driver:main",
+            "can_log = pcw_sim_bridge.can.can_log:main",
+            "can_steer_zero = pcw_sim_bridge.can.can_steer_zero:main",
+            "drive_emulator = pcw_sim_bridge.can.drive_emulator:main",
             "markers = pcw_sim_bridge.nodes.markers:main",
             "mismatch = pcw_sim_bridge.mismatch.__main__:main",
             "mismatch_monitor = pcw_sim_bridge.nodes.mismatch_monitor:main",
