@@ -1,13 +1,16 @@
 """Controllers for powered-caster robots: computed torque, quintic trajectories, torque limits; excitations."""
 
-from .computed_torque import (
-    ComputedTorque,
-    ComputedTorqueMeasurement,
-    ComputedTorqueOutput,
-    ComputedTorqueParameters,
-    ComputedTorqueState,
+from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState
+from .controller_interface import (
+    Controller,
+    ControllerMeasurement,
+    ControllerOutput,
+    ControllerParameters,
+    ForceReference,
     TwistReference,
+    internal_forces,
 )
+from .controllers import CONTROLLERS, make_controller
 from .errors import ControlError
 from .excitation import EXCITATIONS, Excitation, make_excitation, read_excitation
 from .motion_range import MotionRange
@@ -15,14 +18,18 @@ from .quintic_trajectory import MotionLimits, QuinticTrajectory, TrajectoryPoint
 from .torque_limits import LimitedTorque, TorqueLimits, limit_torque
 
 __all__ = [
+    "CONTROLLERS",
     "ComputedTorque",
-    "ComputedTorqueMeasurement",
-    "ComputedTorqueOutput",
     "ComputedTorqueParameters",
     "ComputedTorqueState",
     "ControlError",
+    "Controller",
+    "ControllerMeasurement",
+    "ControllerOutput",
+    "ControllerParameters",
     "EXCITATIONS",
     "Excitation",
+    "ForceReference",
     "LimitedTorque",
     "MotionLimits",
     "MotionRange",
@@ -30,7 +37,9 @@ __all__ = [
     "TorqueLimits",
     "TrajectoryPoint",
     "TwistReference",
+    "internal_forces",
     "limit_torque",
+    "make_controller",
     "make_excitation",
     "plan_point_to_point",
     "read_excitation",

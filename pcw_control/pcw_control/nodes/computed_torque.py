@@ -29,7 +29,8 @@ from pcw_description.nodes.node_tools import (
     wait_until_heard,
 )
 
-from ..computed_torque import ComputedTorque, ComputedTorqueMeasurement, TwistReference, initial_state
+from ..computed_torque import ComputedTorque
+from ..controller_interface import ControllerMeasurement, TwistReference
 from ..quintic_trajectory import TrajectoryPoint, plan_point_to_point
 from ..torque_limits import limit_torque
 from .controller_parameters import (
@@ -90,7 +91,7 @@ class ComputedTorqueNode(LifecycleNode):
         self._watch = StampWatch(LONGEST_GAP)
         self._silence = Silence(self._watch)
         self._odometry = odometry.initial_state()
-        self._state = initial_state()
+        self._state = self._controller.initial_state()
         self._engaged = False  # a torque other than zero may be out
         self._torque, self._saturated = np.zeros((self.robot.n, 2)), False
         self._twist: np.ndarray | None = None
@@ -117,8 +118,8 @@ class ComputedTorqueNode(LifecycleNode):
         at_rest = np.zeros((self.robot.n, 2))
         moving, _ = odometry.update(self.robot, ODOMETRY, odometry.initial_state(), at_rest, 1.0)
         odometry.update(self.robot, ODOMETRY, moving, at_rest, 1.0)
-        measurement = ComputedTorqueMeasurement(at_rest, at_rest, np.zeros(3))
-        self._controller.step(initial_state(), measurement, TwistReference(np.zeros(3)), 1.0)
+        measurement = ControllerMeasurement(at_rest, at_rest, np.zeros(3))
+        self._controller.step(self._controller.initial_state(), measurement, TwistReference(np.zeros(3)), 1.0)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Begin to answer joint_states, with zero torque until there is a reference."""
@@ -258,8 +259,8 @@ class ComputedTorqueNode(LifecycleNode):
             self._disengage()
             return
         if not self._engaged:
-            self._state, self._engaged = initial_state(moved.twist), True
-        measurement = ComputedTorqueMeasurement(position, velocity, self._odometry.pose, self._saturated)
+            self._state, self._engaged = self._controller.initial_state(moved.twist), True
+        measurement = ControllerMeasurement(position, velocity, self._odometry.pose, self._saturated)
         self._state, output = self._controller.step(self._state, measurement, reference, dt)
         limited = limit_torque(self._limits, self._torque, output.torque, velocity, dt)
         if limited.fault:

@@ -1,0 +1,52 @@
+"""All controllers by name, so that a node, a command or a study can choose one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from pcw_description.errors import nearest_name
+from pcw_description.robot_description import RobotDescription
+
+from .computed_torque import ComputedTorque, ComputedTorqueParameters
+from .controller_interface import Controller, ControllerParameters
+from .errors import ControlError
+
+
+@dataclasses.dataclass(frozen=True)
+class ControllerEntry:
+    """One controller to choose.
+
+    Attributes:
+        controller: its class, made from a robot and parameters.
+        parameters: the class of its parameters.
+        summary: one line on what it does.
+    """
+
+    controller: Callable[..., Controller]
+    parameters: type[ControllerParameters]
+    summary: str
+
+
+CONTROLLERS: dict[str, ControllerEntry] = {
+    "computed_torque": ControllerEntry(
+        ComputedTorque, ComputedTorqueParameters, "computed torque with the least internal force, through A (table 5.2)"
+    ),
+}
+
+
+def make_controller(name: str, robot: RobotDescription, parameters: ControllerParameters | None = None) -> Controller:
+    """Make the controller of a name.
+
+    Raises:
+        ControlError: the name is unknown, or the parameters are another controller's.
+        KinematicsError: a caster without offset.
+    """
+    if name not in CONTROLLERS:
+        raise ControlError(f"controller {name!r} is not known; {nearest_name(name, CONTROLLERS)}")
+    entry = CONTROLLERS[name]
+    if parameters is not None and not isinstance(parameters, entry.parameters):
+        raise ControlError(
+            f"parameters of {name} = {type(parameters).__name__} are not allowed; allowed: {entry.parameters.__name__}"
+        )
+    return entry.controller(robot, parameters)
