@@ -11,6 +11,7 @@ from pcw_description.robot_description import RobotDescription
 from .computed_torque import ComputedTorque, ComputedTorqueParameters
 from .controller_interface import Controller, ControllerParameters
 from .errors import ControlError
+from .slip_constraint_force import SlipConstraintForce, SlipConstraintForceParameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +32,9 @@ class ControllerEntry:
 CONTROLLERS: dict[str, ControllerEntry] = {
     "computed_torque": ControllerEntry(
         ComputedTorque, ComputedTorqueParameters, "computed torque with the least internal force, through A (table 5.2)"
+    ),
+    "slip_constraint_force": ControllerEntry(
+        SlipConstraintForce, SlipConstraintForceParameters, "computed torque with internal forces that hold slip (table 5.4)"
     ),
 }
 
