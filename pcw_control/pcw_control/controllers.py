@@ -11,6 +11,7 @@ from pcw_description.robot_description import RobotDescription
 from .computed_torque import ComputedTorque, ComputedTorqueParameters
 from .controller_interface import Controller, ControllerParameters
 from .errors import ControlError
+from .force_guided import ForceGuided, ForceGuidedParameters, UnifiedForceMotion
 from .slip_constraint_force import SlipConstraintForce, SlipConstraintForceParameters
 
 
@@ -35,6 +36,12 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     ),
     "slip_constraint_force": ControllerEntry(
         SlipConstraintForce, SlipConstraintForceParameters, "computed torque with internal forces that hold slip (table 5.4)"
+    ),
+    "force_guided": ControllerEntry(
+        ForceGuided, ForceGuidedParameters, "gives way to a measured push, with internal forces that hold slip (table 5.5)"
+    ),
+    "force_guided_plain": ControllerEntry(
+        UnifiedForceMotion, ForceGuidedParameters, "gives way to a measured push; slip is not held"
     ),
 }
 

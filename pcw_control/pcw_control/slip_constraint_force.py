@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
@@ -173,16 +174,13 @@ def internal_part(A, K, w):  # type: ignore[no-untyped-def]
 @compiled
 def _solved(m, v):  # type: ignore[no-untyped-def]
     """Return m^-1 v of a symmetric 3x3 matrix."""
-    a, b, c = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2], m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2], m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-    d, e, f = m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2], m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
-    determinant = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
-    return np.array(
-        [
-            (a * v[0] + b * v[1] + c * v[2]) / determinant,
-            (b * v[0] + d * v[1] + e * v[2]) / determinant,
-            (c * v[0] + e * v[1] + f * v[2]) / determinant,
-        ]
-    )
+    a, b = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2], m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    c, d = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1], m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
+    e, f = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
+    solution = np.empty(3)
+    solution[0], solution[1] = a * v[0] + b * v[1] + c * v[2], b * v[0] + d * v[1] + e * v[2]
+    solution[2] = c * v[0] + e * v[1] + f * v[2]
+    return solution / (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c)
 
 
 @compiled
@@ -237,25 +235,29 @@ class SlipConstraintForce(ComputedTorque):
     """SCFC, table 5.4: computed torque, its forces without internal ones, and the internal forces that hold slip.
 
     It needs encoders only; `slip` of the measurement is not looked at, because what it could add is taken away by I - Q.
+    Mixed with another controller it adds these internal forces to that one's distribution; `parameters` then has a field
+    `slip` and `_state_type` a field `slip_integral`.
     """
+
+    _state_type: type[Any] = SlipConstraintForceState
 
     def __init__(self, robot: RobotDescription, parameters: SlipConstraintForceParameters | None = None) -> None:
         p = parameters or SlipConstraintForceParameters()
         super().__init__(robot, p)
         self.law = SlipConstraintLaw(robot, p.slip)
 
-    def initial_state(self, twist: FloatArray | None = None) -> SlipConstraintForceState:
+    def initial_state(self, twist: FloatArray | None = None) -> Any:
         """Return the state of a controller that takes over at a twist (3,), or at rest."""
         plain = super().initial_state(twist)
-        return SlipConstraintForceState(plain.reference_twist, plain.error_integral, self.law.initial_state())
+        return self._state_type(**vars(plain), slip_integral=self.law.initial_state())
 
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
     ) -> tuple[ComputedTorqueState, FloatArray]:
         """Return the contact forces (n, 2) of the distribution below and the internal ones that hold slip."""
         state, F_con = super()._distribute(state, demand, measurement, dt)
-        assert isinstance(state, SlipConstraintForceState)
+        held: Any = state
         integral, internal = self.law.step(
-            state.slip_integral, demand.A, np.ascontiguousarray(measurement.joint_velocity), measurement.saturated, dt
+            held.slip_integral, demand.A, np.ascontiguousarray(measurement.joint_velocity), measurement.saturated, dt
         )
-        return dataclasses.replace(state, slip_integral=integral), F_con + internal.force
+        return dataclasses.replace(held, slip_integral=integral), F_con + internal.force
