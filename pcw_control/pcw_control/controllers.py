@@ -11,6 +11,14 @@ from pcw_description.robot_description import RobotDescription
 from .computed_torque import ComputedTorque, ComputedTorqueParameters
 from .controller_interface import Controller, ControllerParameters
 from .errors import ControlError
+from .friction_sharing import (
+    FrictionOptimal,
+    FrictionParameters,
+    JacobianPseudoInverse,
+    TractionLimitAvoidance,
+    TractionLimitParameters,
+    WeightedPseudoInverse,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +39,18 @@ class ControllerEntry:
 CONTROLLERS: dict[str, ControllerEntry] = {
     "computed_torque": ControllerEntry(
         ComputedTorque, ComputedTorqueParameters, "computed torque with the least internal force, through A (table 5.2)"
+    ),
+    "friction_optimal": ControllerEntry(
+        FrictionOptimal, FrictionParameters, "the largest use of friction is as small as can be (a quadratic program)"
+    ),
+    "jacobian_pseudo_inverse": ControllerEntry(
+        JacobianPseudoInverse, ComputedTorqueParameters, "computed torque with the least joint torques, through J (fig. 5.7)"
+    ),
+    "traction_limit_avoidance": ControllerEntry(
+        TractionLimitAvoidance, TractionLimitParameters, "TLA: no wheel beyond a part of its limits (table 5.3)"
+    ),
+    "weighted_pseudo_inverse": ControllerEntry(
+        WeightedPseudoInverse, FrictionParameters, "wheels share the force as friction and load allow, (mu F_z)^2"
     ),
 }
 
