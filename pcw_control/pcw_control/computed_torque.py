@@ -143,7 +143,7 @@ class ComputedTorque:
         self._geometry = (robot.steer_axis, robot.caster_offset)
         self._radius = robot.wheel_radius
         self._B = joint_matrix_blocks(robot)
-        self._B_inverse = np.linalg.inv(self._B)
+        self._B_inverse: FloatArray = np.linalg.inv(self._B).astype(np.float64)
         self._speed_limit = robot.speed_limit * self.parameters.joint_speed_fraction
         gain = self.parameters.integral_gain
         self._largest_integral = np.array(self.parameters.integral_limit) / gain if gain > 0.0 else np.zeros(3)

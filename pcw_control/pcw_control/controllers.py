@@ -12,7 +12,20 @@ from .computed_torque import ComputedTorque, ComputedTorqueParameters
 from .controller_interface import Controller, ControllerParameters
 from .errors import ControlError
 from .force_guided import ForceGuided, ForceGuidedParameters, UnifiedForceMotion
-from .slip_constraint_force import SlipConstraintForce, SlipConstraintForceParameters
+from .friction_sharing import (
+    FrictionOptimal,
+    FrictionParameters,
+    JacobianPseudoInverse,
+    TractionLimitAvoidance,
+    TractionLimitParameters,
+    WeightedPseudoInverse,
+)
+from .slip_constraint_force import (
+    FrictionOptimalSlipConstraint,
+    FrictionOptimalSlipConstraintParameters,
+    SlipConstraintForce,
+    SlipConstraintForceParameters,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +47,24 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     "computed_torque": ControllerEntry(
         ComputedTorque, ComputedTorqueParameters, "computed torque with the least internal force, through A (table 5.2)"
     ),
+    "friction_optimal": ControllerEntry(
+        FrictionOptimal, FrictionParameters, "the largest use of friction is as small as can be (a quadratic program)"
+    ),
+    "jacobian_pseudo_inverse": ControllerEntry(
+        JacobianPseudoInverse, ComputedTorqueParameters, "computed torque with the least joint torques, through J (fig. 5.7)"
+    ),
+    "traction_limit_avoidance": ControllerEntry(
+        TractionLimitAvoidance, TractionLimitParameters, "TLA: no wheel beyond a part of its limits (table 5.3)"
+    ),
+    "weighted_pseudo_inverse": ControllerEntry(
+        WeightedPseudoInverse, FrictionParameters, "wheels share the force as friction and load allow, (mu F_z)^2"
+    ),
     "slip_constraint_force": ControllerEntry(
         SlipConstraintForce, SlipConstraintForceParameters, "computed torque with internal forces that hold slip (table 5.4)"
+    ),
+    "friction_optimal_slip_constraint": ControllerEntry(
+        FrictionOptimalSlipConstraint, FrictionOptimalSlipConstraintParameters,
+        "shares the force as friction allows, with internal forces that hold slip",
     ),
     "force_guided": ControllerEntry(
         ForceGuided, ForceGuidedParameters, "gives way to a measured push, with internal forces that hold slip (table 5.5)"

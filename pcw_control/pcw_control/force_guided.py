@@ -9,8 +9,8 @@ robot behaves like a body of mass M with friction D, whose twist V_f is the thes
 
 F_sensor = -f, because the push acts on the robot as well. What differs from the table:
 
-* f_o = k (A V_f - B q_dot) is projected to internal forces, and (I - A A^+) A V_f = 0: the virtual slip velocity of the table is
-  the slip that encoders see. So f_o is the slip constraint force, and V_f is followed by k_v instead, on and off the ground.
+* f_o = k (A V_f - B q_dot) is projected to internal forces, and (I - A A^+) A V_f = 0: the table's virtual slip velocity is
+  what encoders see of slip. So f_o is the slip constraint force, and V_f is followed by k_v instead, on and off the ground.
 * k_fi and f_d make the robot push back with a motor's energy. They draw it from a tank that only the friction D fills, and
   get nothing when it is empty.
 

@@ -36,6 +36,8 @@ from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDes
 
 from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
 from .controller_interface import ControllerMeasurement, ControllerParameters, parameter
+from .force_distribution import solve_kernel
+from .friction_sharing import FrictionOptimal, FrictionParameters
 
 # Phase that the delay may take from the loop of a wheel without grip [rad]; pi/2 is where it would swing on its own. It
 # leaves a margin of 65 degrees, and k_p = 400 N s/m along for the thesis's robot of 90 kg at 500 Hz.
@@ -162,25 +164,13 @@ def internal_part(A, K, w):  # type: ignore[no-untyped-def]
             moment[j] += weighted[0, j] * w[i, 0] + weighted[1, j] * w[i, 1]  # K is symmetric
             for k in range(3):
                 normal[j, k] += A[2 * i, j] * weighted[0, k] + A[2 * i + 1, j] * weighted[1, k]
-    V = _solved(normal, moment)
+    V = solve_kernel(normal, moment)
     internal = np.empty((n, 2))
     for i in range(n):
         for j in range(2):
             row = 2 * i + j
             internal[i, j] = w[i, j] - (A[row, 0] * V[0] + A[row, 1] * V[1] + A[row, 2] * V[2])
     return internal
-
-
-@compiled
-def _solved(m, v):  # type: ignore[no-untyped-def]
-    """Return m^-1 v of a symmetric 3x3 matrix."""
-    a, b = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2], m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
-    c, d = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1], m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
-    e, f = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
-    solution = np.empty(3)
-    solution[0], solution[1] = a * v[0] + b * v[1] + c * v[2], b * v[0] + d * v[1] + e * v[2]
-    solution[2] = c * v[0] + e * v[1] + f * v[2]
-    return solution / (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c)
 
 
 @compiled
@@ -261,3 +251,21 @@ class SlipConstraintForce(ComputedTorque):
             held.slip_integral, demand.A, np.ascontiguousarray(measurement.joint_velocity), measurement.saturated, dt
         )
         return dataclasses.replace(held, slip_integral=integral), F_con + internal.force
+
+
+@dataclasses.dataclass(frozen=True)
+class FrictionOptimalSlipConstraintParameters(FrictionParameters, SlipConstraintForceParameters):
+    """Those of both: what is known of the ground, and how slip is held."""
+
+
+class FrictionOptimalSlipConstraint(SlipConstraintForce, FrictionOptimal):
+    """QP + SCFC: the distribution that uses friction least, and the internal forces that hold slip.
+
+    The first needs the friction under each wheel (`friction`, of the nominal ground where it is not measured), the second
+    finds out where that was wrong.
+    """
+
+    def __init__(
+        self, robot: RobotDescription, parameters: FrictionOptimalSlipConstraintParameters | None = None
+    ) -> None:
+        super().__init__(robot, parameters or FrictionOptimalSlipConstraintParameters())

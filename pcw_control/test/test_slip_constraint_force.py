@@ -62,7 +62,7 @@ def force_of(robot, parameters, steer_angle, joint_velocity):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_keeps_the_controllers_contract(name):
     robot = load_robot(name)
-    for entry in ("slip_constraint_force",):
+    for entry in ("slip_constraint_force", "friction_optimal_slip_constraint"):
         contract.check_contract(make_controller(entry, robot), robot, np.random.default_rng(5))
 
 
