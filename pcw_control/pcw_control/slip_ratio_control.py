@@ -1,10 +1,10 @@
-"""Slip-ratio control of one wheel, section 5.3.1 [Li2009], with its dynamics as they follow from the wheel's, driving and braking.
+"""Slip-ratio control of one wheel, section 5.3.1 [Li2009], with the dynamics that follow from the wheel's own.
 
 Slip ratio (3.43) and wheel (3.45): lambda = (r rho_dot - v) / max(|r rho_dot|, |v|),  r rho_ddot = r (tau - r F) / I,
-v_dot = F / m, with m the mass that the wheel carries. By differentiation, lambda_dot = f + g tau, with the sign a of the motion,
+v_dot = F / m, with m the mass that the wheel carries. By differentiation lambda_dot = f + g tau; a is the sign of the motion:
 
-    driving, |r rho_dot| >= |v|:  f = -F [(1 - a lambda) r^2 / I + 1 / m] / |r rho_dot|,  g = (1 - a lambda) r / (I |r rho_dot|)
-    braking, |v| > |r rho_dot|:   f = -F [r^2 / I + (1 + a lambda) / m] / |v|,            g = r / (I |v|)
+    driving, |r rho_dot| >= |v|: f = -F [(1 - a lambda) r^2 / I + 1 / m] / |r rho_dot|, g = (1 - a lambda) r / (I |r rho_dot|)
+    braking, |v| > |r rho_dot|:  f = -F [r^2 / I + (1 + a lambda) / m] / |v|,           g = r / (I |v|)
 
 (5.10) prints the first with I = m r^2 / 2, a solid disc that carries nothing, and without the r in the denominator of f; the
 second is the one that "can be easily derived". They meet at lambda = 0.
