@@ -31,7 +31,7 @@ from pcw_description.differential_kinematics import (
     joint_matrix_blocks,
     wheel_jacobian_kernel,
 )
-from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
+from pcw_description.robot_description import DRIVE, GRAVITY, STEER, FloatArray, RobotDescription
 
 from . import sliding_mode
 from .controller_interface import (
@@ -78,7 +78,7 @@ class SlidingModeRateParameters(ResolvedMotionRateParameters):
     """
 
     disturbance: float = parameter(3.0, "m/s^2", "acceleration of a disturbance that can be made up for", maximum=100.0)
-    filter_time: float = parameter(0.02, "s", "of the low-pass filter", above=0.0, maximum=1.0)
+    filter_time: float = parameter(0.05, "s", "of the low-pass filter", above=0.0, maximum=1.0)
     boundary: float = parameter(0.05, "m/s", "half the width of the boundary layer", above=0.0, maximum=1.0)
     law: str = dataclasses.field(default="low_pass_integral", metadata={"choices": sliding_mode.SLIDING_LAWS})
 
@@ -114,6 +114,20 @@ def effective_mass(robot: RobotDescription) -> FloatArray:
     along = robot.armature[:, DRIVE, DRIVE] + [c.wheel.inertia_axle for c in robot.casters]
     across = robot.armature[:, STEER, STEER] + [c.module.inertia_zz for c in robot.casters]
     return np.stack([share + along / robot.wheel_radius**2, share + across / robot.caster_offset[:, 0] ** 2], axis=1)
+
+
+def settling_time(robot: RobotDescription, filter_time: float) -> FloatArray:
+    """Return T (n, 2) [s] of the sliding mode: 4 g / (eps w_t^2), at most eps; see `sliding_mode`.
+
+    w_t^2 = c (1 / m_w + n / m) with the stiffness of the tyre at small slip, c = 2 mu_p F_z / (lambda_p sigma).
+    """
+    share = robot.total_mass / robot.n
+    own = effective_mass(robot) - share
+    peak = np.array([[t.mu_p / t.lambda_p, t.lateral.mu_p / t.lateral.lambda_p] for t in robot.tyres])
+    stiffness = 2.0 * peak * share * GRAVITY / np.array([[t.relaxation_length] for t in robot.tyres])
+    resonance_squared = stiffness * (1.0 / own + 1.0 / share)
+    settling: FloatArray = np.minimum(4.0 * share / own / (filter_time * resonance_squared), filter_time)
+    return settling
 
 
 class ResolvedMotionRate:
@@ -221,6 +235,7 @@ class SlidingModeRate(ResolvedMotionRate):
 
     def __init__(self, robot: RobotDescription, parameters: SlidingModeRateParameters | None = None) -> None:
         super().__init__(robot, parameters or SlidingModeRateParameters())
+        self._settling = settling_time(robot, self.parameters.filter_time)
         self._gain = np.minimum(self.parameters.disturbance * self._mass, 0.5 * self._force_limit)
 
     def _discontinuous(
@@ -228,5 +243,5 @@ class SlidingModeRate(ResolvedMotionRate):
     ) -> tuple[sliding_mode.SlidingModeState, FloatArray]:
         p = self.parameters
         return sliding_mode.step(
-            p.law, state, error, u_c, self._mass, self._gain, p.filter_time, p.boundary, saturated, dt
+            p.law, state, error, u_c, self._mass, self._gain, p.filter_time, self._settling, p.boundary, saturated, dt
         )

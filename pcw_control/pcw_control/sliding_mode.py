@@ -8,10 +8,13 @@ controller does not know: the acceleration wanted, other wheels, friction, load.
     plain               s = e,  u_dis = K sgn(s)
 
 With the first, m s_dot = D - K sgn(s), whatever u does: s = 0 from the first instant on if K > |D|, there is no reaching
-phase, and the mean of K sgn(s) is D. The motors get only that mean. In sampled time sgn is chosen so that s is zero at
-the end of the step, K sgn(s) = clip(s m / dt, +-K), the implicit Euler rule: nothing switches that the sampling made
-switch. The thesis writes s = -slip + z; with the motion wanted in place of the unknown true one, -slip = A V - B q_dot is
-e.
+phase, and the mean of K sgn(s) is D. The motors get only that mean.
+
+A motor feels the robot through the tyre, a spring: above its resonance w_t the mass is only the wheel's own, m_w, and a
+law that counts on m is g = m / m_w - 1 times too strong. So sgn is replaced by sat(s m / (K T)): s stays within K T / m,
+and the loop over filter and s, g / (eps T w^2) there, stays below 1 / 4 from w_t on with T = 4 g / (eps w_t^2).
+`settling_time` derives it. The thesis writes s = -slip + z; with the motion wanted in place of the unknown true one,
+-slip = A V - B q_dot is e.
 """
 
 from __future__ import annotations
@@ -61,6 +64,7 @@ def step(
     mass: FloatArray,
     gain: FloatArray,
     filter_time: float,
+    settling: FloatArray,
     boundary: float,
     saturated: bool,
     dt: float,
@@ -75,6 +79,7 @@ def step(
         mass: m (n, 2) [kg].
         gain: K (n, 2) [N].
         filter_time: eps [s].
+        settling: T (n, 2) [s]; at least dt is used.
         boundary: phi [m/s].
         saturated: the force before was not made in full: z starts anew, as u is not known.
         dt: measured time since the step before [s].
@@ -91,13 +96,14 @@ def step(
     if law != "low_pass_integral":
         raise ControlError(f"sliding law {law!r} is not allowed; allowed: {', '.join(SLIDING_LAWS)}")
     if state.auxiliary is None or saturated:
-        z, filtered = -error, state.filtered
-        s, switched = np.zeros_like(error), state.filtered
+        # Begin where s says what is known of the disturbance already.
+        filtered = switched = state.filtered
+        s = filtered * np.maximum(settling, dt) / mass
+        z = s - error
     else:
         z = state.auxiliary + dt / mass * (state.force - state.switched)
         s = error + z
-        # What was switched before stays, and the rest of s is brought to zero within this step.
-        switched = np.clip(state.switched + s * mass / dt, -gain, gain)
+        switched = np.clip(s * mass / np.maximum(settling, dt), -gain, gain)
         filtered = state.filtered + (1.0 - math.exp(-dt / filter_time)) * (switched - state.filtered)
     u = continuous + filtered
     return SlidingModeState(z, filtered, switched, u, s), u
