@@ -28,7 +28,6 @@ import math
 import numpy as np
 
 from pcw_description.augmented_object_model import AugmentedObjectModel
-from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import (
     forward_kinematics_kernel,
     joint_matrix_blocks,
@@ -39,7 +38,6 @@ from pcw_description.robot_description import STEER, FloatArray, RobotDescriptio
 from .controller_interface import (
     ControllerMeasurement,
     ControllerOutput,
-    ControllerParameters,
     ForceReference,
     Reference,
     TwistReference,
@@ -48,12 +46,13 @@ from .controller_interface import (
     parameter,
 )
 from .errors import ControlError
-from .quintic_trajectory import MotionLimits, TrajectoryPoint
+from .quintic_trajectory import TrajectoryPoint
+from .reference_motion import MotionParameters, ReferenceMotion
 
 
 @dataclasses.dataclass(frozen=True)
-class ComputedTorqueParameters(ControllerParameters):
-    """Gains and limits.
+class ComputedTorqueParameters(MotionParameters):
+    """Gains, besides the limits of the reference.
 
     The gains are those of a unit mass: Lambda scales them to the robot. The defaults place both poles of the pose error at
     10 rad/s, five times below what a loop delay of 2 ms would disturb.
@@ -62,20 +61,13 @@ class ComputedTorqueParameters(ControllerParameters):
         velocity_gain: k_d [1/s].
         position_gain: k_p on the pose error [1/s^2].
         integral_gain: k_p on the integral of the velocity error, when a twist is followed [1/s^2].
-        joint_speed_fraction: the reference twist is slowed down where a joint would turn faster than this part of its
-            limit. A caster that turns round is the usual cause: it steers at up to v/b.
         integral_limit: largest acceleration that this integral may ask for (x, y [m/s^2], yaw [rad/s^2]).
-        limits: limits of the reference when a twist is followed.
     """
 
     velocity_gain: float = parameter(20.0, "1/s", "gain on the velocity error, k_d", maximum=200.0)
     position_gain: float = parameter(100.0, "1/s^2", "gain on the pose error, k_p", maximum=1e4)
     integral_gain: float = parameter(50.0, "1/s^2", "gain on the integral of the velocity error", maximum=1e4)
-    joint_speed_fraction: float = parameter(
-        0.8, "1", "the reference uses this part of the speed limits", above=0.0, maximum=1.0
-    )
     integral_limit: tuple[float, float, float] = (1.0, 1.0, 3.0)
-    limits: MotionLimits = dataclasses.field(default_factory=lambda: MotionLimits(1.5, 0.5, 3.0, 1.5))
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -144,7 +136,7 @@ class ComputedTorque:
         self._radius = robot.wheel_radius
         self._B = joint_matrix_blocks(robot)
         self._B_inverse: FloatArray = np.linalg.inv(self._B).astype(np.float64)
-        self._speed_limit = robot.speed_limit * self.parameters.joint_speed_fraction
+        self._reference_motion = ReferenceMotion(robot, self.parameters)
         gain = self.parameters.integral_gain
         self._largest_integral = np.array(self.parameters.integral_limit) / gain if gain > 0.0 else np.zeros(3)
 
@@ -209,16 +201,7 @@ class ComputedTorque:
         self, state: ComputedTorqueState, target: FloatArray, V: FloatArray, A: FloatArray, saturated: bool, dt: float
     ) -> tuple[ComputedTorqueState, FloatArray]:
         p = self.parameters
-        limits = p.limits
-        wanted = target * _shrink(target, limits.speed, limits.yaw_rate)
-        wanted = wanted * self._joint_speed_factor(A, wanted)
-        change = wanted - state.reference_twist
-        change = change * _shrink(change, limits.acceleration * dt, limits.yaw_acceleration * dt)
-        V_d = state.reference_twist + change
-        # A caster may turn round in less time than the deceleration allows; then the limit of the joint comes first.
-        V_d = V_d * self._joint_speed_factor(A, V_d, slack=1.0 / p.joint_speed_fraction)
-        change = V_d - state.reference_twist
-        V_dot_d = change / dt * _shrink(change, limits.acceleration * dt, limits.yaw_acceleration * dt)
+        V_d, V_dot_d = self._reference_motion.towards(state.reference_twist, target, A, dt)
         e_dot = V_d - V
         e = state.error_integral
         if not saturated and p.integral_gain > 0.0:
@@ -238,29 +221,6 @@ class ComputedTorque:
         V_dot = R_T @ (point.acceleration + p.position_gain * e) + p.velocity_gain * (V_d - V) - omega_cross_V
         # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
         return dataclasses.replace(state, reference_twist=V_d, error_integral=np.zeros(3)), V_dot
-
-    def _joint_speed_factor(self, A: FloatArray, twist: FloatArray, slack: float = 1.0) -> float:
-        """Return the factor up to 1 that keeps B^-1 A V within the joints' speed limits."""
-        ratio = _largest_joint_speed(A, twist, self._B_inverse, self._speed_limit)
-        return 1.0 / max(1.0, ratio / slack)
-
-
-@compiled
-def _largest_joint_speed(A, twist, B_inverse, speed_limit):  # type: ignore[no-untyped-def]
-    """Return the largest of the joint speeds B^-1 A V relative to their limits (n, 2)."""
-    largest = 0.0
-    for i in range(len(B_inverse)):
-        along = A[2 * i, 0] * twist[0] + A[2 * i, 1] * twist[1] + A[2 * i, 2] * twist[2]
-        across = A[2 * i + 1, 0] * twist[0] + A[2 * i + 1, 1] * twist[1] + A[2 * i + 1, 2] * twist[2]
-        for j in range(2):
-            speed = abs(B_inverse[i, j, 0] * along + B_inverse[i, j, 1] * across)
-            largest = max(largest, speed / speed_limit[i, j])
-    return largest
-
-
-def _shrink(twist: FloatArray, linear: float, angular: float) -> float:
-    """Return the factor up to 1 that brings the translation within `linear` and the turn within `angular`."""
-    return 1.0 / max(1.0, math.hypot(twist[0], twist[1]) / linear, abs(twist[2]) / angular)
 
 
 def _rotation(angle: float) -> FloatArray:

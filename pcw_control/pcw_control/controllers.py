@@ -10,6 +10,7 @@ from pcw_description.robot_description import RobotDescription
 
 from .computed_torque import ComputedTorque, ComputedTorqueParameters
 from .controller_interface import Controller, ControllerParameters
+from .cross_coupling import CrossCoupling, CrossCouplingParameters
 from .errors import ControlError
 from .force_guided import ForceGuided, ForceGuidedParameters, UnifiedForceMotion
 from .friction_sharing import (
@@ -19,6 +20,12 @@ from .friction_sharing import (
     TractionLimitAvoidance,
     TractionLimitParameters,
     WeightedPseudoInverse,
+)
+from .resolved_motion_rate import (
+    ResolvedMotionRate,
+    ResolvedMotionRateParameters,
+    SlidingModeRate,
+    SlidingModeRateParameters,
 )
 from .slip_constraint_force import (
     FrictionOptimalSlipConstraint,
@@ -47,11 +54,20 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     "computed_torque": ControllerEntry(
         ComputedTorque, ComputedTorqueParameters, "computed torque with the least internal force, through A (table 5.2)"
     ),
+    "cross_coupling": ControllerEntry(
+        CrossCoupling, CrossCouplingParameters, "RMRC whose wheels also agree with each other (Feng, Koren, Borenstein)"
+    ),
     "friction_optimal": ControllerEntry(
         FrictionOptimal, FrictionParameters, "the largest use of friction is as small as can be (a quadratic program)"
     ),
     "jacobian_pseudo_inverse": ControllerEntry(
         JacobianPseudoInverse, ComputedTorqueParameters, "computed torque with the least joint torques, through J (fig. 5.7)"
+    ),
+    "resolved_motion_rate": ControllerEntry(
+        ResolvedMotionRate, ResolvedMotionRateParameters, "RMRC: PI control of each wheel on its own (table 5.1)"
+    ),
+    "sliding_mode_rate": ControllerEntry(
+        SlidingModeRate, SlidingModeRateParameters, "SME-RMRC: RMRC enhanced by sliding mode (table 5.1)"
     ),
     "traction_limit_avoidance": ControllerEntry(
         TractionLimitAvoidance, TractionLimitParameters, "TLA: no wheel beyond a part of its limits (table 5.3)"
