@@ -12,6 +12,7 @@ from .computed_torque import ComputedTorque, ComputedTorqueParameters
 from .controller_interface import Controller, ControllerParameters
 from .cross_coupling import CrossCoupling, CrossCouplingParameters
 from .errors import ControlError
+from .force_guided import ForceGuided, ForceGuidedParameters, UnifiedForceMotion
 from .friction_sharing import (
     FrictionOptimal,
     FrictionParameters,
@@ -25,6 +26,12 @@ from .resolved_motion_rate import (
     ResolvedMotionRateParameters,
     SlidingModeRate,
     SlidingModeRateParameters,
+)
+from .slip_constraint_force import (
+    FrictionOptimalSlipConstraint,
+    FrictionOptimalSlipConstraintParameters,
+    SlipConstraintForce,
+    SlipConstraintForceParameters,
 )
 
 
@@ -67,6 +74,19 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     ),
     "weighted_pseudo_inverse": ControllerEntry(
         WeightedPseudoInverse, FrictionParameters, "wheels share the force as friction and load allow, (mu F_z)^2"
+    ),
+    "slip_constraint_force": ControllerEntry(
+        SlipConstraintForce, SlipConstraintForceParameters, "computed torque with internal forces that hold slip (table 5.4)"
+    ),
+    "friction_optimal_slip_constraint": ControllerEntry(
+        FrictionOptimalSlipConstraint, FrictionOptimalSlipConstraintParameters,
+        "shares the force as friction allows, with internal forces that hold slip",
+    ),
+    "force_guided": ControllerEntry(
+        ForceGuided, ForceGuidedParameters, "gives way to a measured push, with internal forces that hold slip (table 5.5)"
+    ),
+    "force_guided_plain": ControllerEntry(
+        UnifiedForceMotion, ForceGuidedParameters, "gives way to a measured push; slip is not held"
     ),
 }
 
