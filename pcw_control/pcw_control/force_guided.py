@@ -35,13 +35,7 @@ import numpy as np
 from pcw_description.compiled import compiled
 from pcw_description.robot_description import FloatArray, RobotDescription
 
-from .computed_torque import (
-    ComputedTorque,
-    ComputedTorqueParameters,
-    ComputedTorqueState,
-    Demand,
-    _largest_joint_speed,
-)
+from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
 from .controller_interface import (
     ControllerMeasurement,
     ControllerOutput,
@@ -50,6 +44,7 @@ from .controller_interface import (
     parameter,
 )
 from .errors import ControlError
+from .reference_motion import _largest_joint_speed
 from .slip_constraint_force import SlipConstraintForce, SlipConstraintParameters
 
 # What guards V_f in a cycle; the last in this order that acted is reported.
@@ -165,6 +160,7 @@ class UnifiedForceMotion(ComputedTorque):
         inertia = p.virtual_inertia or FELT_SHARE * own[2, 2]
         self.virtual_mass = np.array([mass, mass, inertia])
         self._follows = np.array(p.force_controlled)
+        self._speed_limit = robot.speed_limit * p.joint_speed_fraction
         self._largest_change = p.force_limit / self.virtual_mass
         self._numbers = np.array(
             [

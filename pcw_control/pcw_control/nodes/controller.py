@@ -114,8 +114,6 @@ class ControllerNode(LifecycleNode):
 
     def _take_over(self) -> None:
         """Let the new controller begin where the old one is: at its reference twist, and without a jump of torque."""
-        if self._active:
-            self._warm_up()  # compiled before it is asked, not while the robot waits
         if self._driving:
             self._state = self._controller.initial_state(self._reference_twist)
             self._handover = handover.begin_handover(self._passed.torque)
@@ -155,15 +153,20 @@ class ControllerNode(LifecycleNode):
         return super().on_configure(state)
 
     def _warm_up(self) -> None:
+        """Have odometry, every controller and the gate compiled: any of them may take over while the robot drives."""
         at_rest = np.zeros((self.robot.n, 2))
         moving, _ = odometry.update(self.robot, ODOMETRY, odometry.initial_state(), at_rest, 1.0)
         odometry.update(self.robot, ODOMETRY, moving, at_rest, 1.0)
-        measurement = self._told(ControllerMeasurement(at_rest, at_rest, np.zeros(3), external_wrench=np.zeros(3)))
-        reference: Reference = TwistReference(np.zeros(3))
-        if "external_wrench" in self._uses:
-            reference = ForceReference(np.zeros(3), reference)
-        _, output = self._controller.step(self._controller.initial_state(), measurement, reference, 0.01)
-        self._gate.pass_torque(self._gate.initial_state(), output.torque, at_rest, 0.01, frozenset())
+        measurement = ControllerMeasurement(
+            at_rest, at_rest, np.zeros(3), slip=at_rest, slip_valid=np.ones(at_rest.shape, dtype=bool),
+            friction=np.full(self.robot.n, 0.5), external_wrench=np.zeros(3),
+        )
+        for name, entry in CONTROLLERS.items():
+            controller = make_controller(name, self.robot, controller_parameters(self, name))
+            motion = TwistReference(np.zeros(3))
+            reference = ForceReference(np.zeros(3), motion) if "external_wrench" in entry.parameters.uses else motion
+            _, output = controller.step(controller.initial_state(), measurement, reference, 0.01)
+            self._gate.pass_torque(self._gate.initial_state(), output.torque, at_rest, 0.01, frozenset())
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Begin to answer joint_states, with zero torque until there is a reference."""

@@ -68,8 +68,8 @@ def declare_controller_parameters(node: Node) -> None:
         )
     declare(node, "torque_limit_mode", "scale", "scale keeps the direction of the wrench, clip cuts each joint", choices=MODES)
     declare(node, "torque_slew", 0.0, "largest change of a joint torque per time; 0 is no limit", "N m/s", (0.0, 1e6))
-    declare(node, "jerk_limit", 0.0, "largest jerk that a wheel is driven with; 0 is no limit", "m/s^3", (0.0, 1e5))
-    declare(node, "power_limit", 0.0, "largest mechanical power of all joints that drive; 0 is no limit", "W", (0.0, 1e6))
+    declare(node, "drive_jerk", 0.0, "largest jerk that a wheel is driven with; 0 is no limit", "m/s^3", (0.0, 1e5))
+    declare(node, "drive_power", 0.0, "largest mechanical power of all joints that drive; 0 is no limit", "W", (0.0, 1e6))
 
 
 def motion_limits(node: Node, prefix: str = "goal") -> MotionLimits:
@@ -92,7 +92,7 @@ def controller_parameters(node: Node, controller: str) -> ControllerParameters:
 def torque_limits(node: Node, robot: RobotDescription) -> TorqueLimits:
     """Return the robot's torque limits with the mode, slew, jerk and power of the parameters."""
     numbers = {name: node.get_parameter(parameter).value for name, parameter in (
-        ("slew", "torque_slew"), ("power", "power_limit"), ("jerk", "jerk_limit"),
+        ("slew", "torque_slew"), ("power", "drive_power"), ("jerk", "drive_jerk"),
     )}
     given = {name: value if value > 0.0 else None for name, value in numbers.items()}
     return TorqueLimits.of_robot(robot, node.get_parameter("torque_limit_mode").value, **given)
