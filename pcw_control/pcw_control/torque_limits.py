@@ -24,8 +24,8 @@ import numpy as np
 from pcw_description.compiled import compiled
 from pcw_description.robot_description import FloatArray, RobotDescription
 
+from .delay_margin import effective_mass
 from .errors import ControlError
-from .resolved_motion_rate import effective_mass
 
 MODES = ("scale", "clip")
 
