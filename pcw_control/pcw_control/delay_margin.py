@@ -24,7 +24,7 @@ import numpy as np
 
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, FloatArray, RobotDescription
 
-# What a loop has to bear at rest besides the hold, without any damping of its tyres [s]; rolling, it bears about twice as much.
+# What a loop has to bear at rest besides the hold, with tyres that damp nothing [s]; rolling, it bears about twice as much.
 DELAY = 0.001
 # A gain is never derived so small that the robot stands still, however soft its tyres are; in parts of the one asked for.
 LEAST_PART = 0.2

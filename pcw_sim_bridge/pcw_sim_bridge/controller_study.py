@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from pcw_control.computed_torque import ComputedTorque
-from pcw_control.controller_interface import Controller, Reference, TwistReference
+from pcw_control.controller_interface import Controller, TwistReference
+from pcw_control.force_distribution import jacobian_forces, weighted_forces
 from pcw_control.friction_sharing import (
     BasicSolution,
     JacobianPseudoInverse,
@@ -30,7 +31,11 @@ from pcw_control.resolved_motion_rate import (
     SlidingModeRateParameters,
 )
 from pcw_control.sliding_mode import SLIDING_LAWS
-from pcw_description.differential_kinematics import forward_kinematics_kernel
+from pcw_description.differential_kinematics import (
+    forward_kinematics_kernel,
+    joint_matrix_blocks,
+    wheel_jacobian,
+)
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 from pcw_description.robot_file import load_robot
@@ -44,7 +49,7 @@ LOAD_MISMATCH = 0.3  # of the robot's mass
 STEP_SPEED = 0.1  # of fig. 5.2, twice the boundary layer: what the robot, at rest, is taken over at [m/s]
 
 
-def straight(length: float, limits: MotionLimits) -> tuple[Callable[[float], Reference], float]:
+def straight(length: float, limits: MotionLimits) -> tuple[Callable[[float], TrajectoryPoint], float]:
     """Return a quintic straight ahead as a reference, and its duration."""
     trajectory = plan_point_to_point(TrajectoryPoint(np.zeros(3)), TrajectoryPoint(np.array([length, 0.0, 0.0])), limits)
     return trajectory.sample, trajectory.duration
@@ -124,10 +129,10 @@ def figure_5_2(document: Document) -> None:
     document.add("## Fig. 5.2: chattering, and the phase of reaching", "")
     document.add(
         f"A robot with {LOAD_MISMATCH:.0%} of load that nobody told the controller, at rest, is taken over at {STEP_SPEED} "
-        f"m/s: that is the velocity error at the first sample. Chatter: RMS of all torques above {CHATTER_FROM:g} Hz. Bound of s: "
-        "K T / m for the filtered law, the layer phi for the boundary layer.", "",
+        f"m/s: that is the velocity error at the first sample. Chatter: RMS of all torques above {CHATTER_FROM:g} Hz. Bound "
+        "of s: K T / m for the filtered law, the layer phi for the boundary layer.", "",
     )
-    rows = []
+    rows, target = [], TwistReference(np.array([STEP_SPEED, 0.0, 0.0]))
     for robot_name in ROBOTS:
         robot = load_robot(robot_name)
         for plant in PLANTS:
@@ -135,8 +140,7 @@ def figure_5_2(document: Document) -> None:
             for law in SLIDING_LAWS:
                 controller = SlidingModeRate(robot, SlidingModeRateParameters(law=law))
                 begun = _TakenOver(controller, np.array([STEP_SPEED, 0.0, 0.0]))
-                target = TwistReference(np.array([STEP_SPEED, 0.0, 0.0]))
-                run = run_closed_loop(overloaded(robot), begun, lambda _, t=target: t, 2.0, plant, seed=1)
+                run = run_closed_loop(overloaded(robot), begun, lambda _: target, 2.0, plant, seed=1)
                 s = np.array([state.sliding.sliding for state in run.states])  # type: ignore[attr-defined]
                 bound = np.full((robot.n, 2), controller.parameters.boundary)
                 if law == "low_pass_integral":
@@ -207,8 +211,8 @@ def figures_5_6_to_5_8(document: Document, seeds: int) -> None:
     document.add(
         "A quintic of 2 m straight ahead of the thesis robot from random headings of the wheels. Spread: RMS of what of the "
         "wheel speeds no motion of the robot explains, (I - A A^+) B q_dot. `J`: the least sum of squared joint torques; "
-        "`three forces`: a basic solution of (5.4), in which three of the eight forces carry everything. Thesis: 4.2 N m through J, "
-        "3.5 N m through A, a ratio of 0.83, on its robot from headings that it does not state.", "",
+        "`three forces`: a basic solution of (5.4), in which three of the eight forces carry everything. Thesis: 4.2 N m "
+        "through J, 3.5 N m through A, a ratio of 0.83, on its robot from headings that it does not state.", "",
     )
     robot = load_robot("thesis")
     reference, duration = straight(2.0, MotionLimits(0.8, 0.8))
@@ -256,29 +260,27 @@ def figures_5_6_to_5_8(document: Document, seeds: int) -> None:
 
 def _statics(robot: RobotDescription) -> list[str]:
     """Say over many headings how the peak torques of a push straight ahead compare."""
-    from pcw_control.force_distribution import jacobian_forces, weighted_forces
-    from pcw_description.differential_kinematics import joint_matrix_blocks, wheel_jacobian
-
     B = joint_matrix_blocks(robot)
+    B_inverse: FloatArray = np.linalg.inv(B).astype(np.float64)
     rng, ratios = np.random.default_rng(57), []
     for _ in range(2000):
         A, F = wheel_jacobian(robot, rng.uniform(-math.pi, math.pi, robot.n)), np.array([100.0, 0.0, 0.0])
         peaks = [
             np.abs(np.einsum("nji,nj->ni", B, force)).max()
-            for force in (weighted_forces(A, F, np.ones((robot.n, 2))), jacobian_forces(A, F, np.linalg.inv(B)))
+            for force in (weighted_forces(A, F, np.ones((robot.n, 2))), jacobian_forces(A, F, B_inverse))
         ]
         ratios.append(peaks[0] / peaks[1])
     low, middle, high = np.percentile(ratios, [5, 50, 95])
     return [
         f"Over 2000 random headings, standing still, the peak torque of a push straight ahead through A is {middle:.2f} of "
         f"that through J (5 to 95 %: {low:.2f} to {high:.2f}); {np.mean(np.array(ratios) <= 0.85):.1%} of the headings reach "
-        "0.85. J minimises the sum of squared torques, so its peak is seldom the higher one: only where one wheel with a short lever "
-        "stands across beside several along does it get more than its share.",
+        "0.85. J minimises the sum of squared torques, so its peak is seldom the higher one: only where one wheel with a short "
+        "lever stands across beside several along does it get more than its share.",
     ]
 
 
 def _with_limits(
-    document: Document, robot: RobotDescription, reference: Callable[[float], Reference], duration: float
+    document: Document, robot: RobotDescription, reference: Callable[[float], TrajectoryPoint], duration: float
 ) -> None:
     """Figs. 5.7 (b), 5.8 (b): internal forces keep the limits."""
     rng = np.random.default_rng([0, 56])
@@ -298,7 +300,7 @@ def _with_limits(
         controller = TractionLimitAvoidance(limited, TractionLimitParameters(traction_share=share))
         run = run_closed_loop(robot, controller, reference, duration, plant, 0, steer_angle)
         used = np.abs(run.torque).max(axis=(0, 1)) / np.array([peak[0] / 0.96, peak[1] / 0.96])
-        error = run.pose[-1] - reference(duration).pose  # type: ignore[union-attr]
+        error = run.pose[-1] - reference(duration).pose
         rows.append([plant, f"{used[0]:.4f}", f"{used[1]:.4f}", f"{1e3 * np.hypot(*error[:2]):.1f} mm"])
     document.add(
         "### With limits, figs. 5.7 (b) and 5.8 (b)", "",
