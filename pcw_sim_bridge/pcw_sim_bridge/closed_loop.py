@@ -57,6 +57,7 @@ def run_closed_loop(
     steer_angle: FloatArray | None = None,
     limited: bool = True,
     measure: Callable[[ControllerMeasurement], ControllerMeasurement] | None = None,
+    lifted: bool = False,
 ) -> ClosedLoopRun:
     """Drive a robot on a plant.
 
@@ -70,8 +71,9 @@ def run_closed_loop(
         steer_angle: headings of the wheels at the start (n,) [rad]; None is all ahead.
         limited: whether the torques pass the torque limits.
         measure: what else the controller is told, added to a measurement.
+        lifted: on a jack, the wheels off the ground.
     """
-    simulated = SimulatedRobot(make_plant(plant, robot), seed)
+    simulated = SimulatedRobot(make_plant(plant, robot, lifted=lifted), seed)
     if steer_angle is not None:
         simulated.plant.reset(steer_angle=steer_angle)
     believed: RobotDescription = controller.robot  # type: ignore[attr-defined]
