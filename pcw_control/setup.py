@@ -42,6 +42,8 @@ setup(
     entry_points={
         "console_scripts": [
             "computed_torque = pcw_control.nodes.computed_torque:main",
+            "controller = pcw_control.nodes.controller:main",
+            "gain_check = pcw_control.gain_check:main",
         ],
     },
 )

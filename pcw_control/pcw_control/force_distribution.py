@@ -99,6 +99,22 @@ def jacobian_forces(A: FloatArray, wrench: FloatArray, B_inverse: FloatArray) ->
     return np.einsum("nji,nj->ni", B_inverse, tau)
 
 
+def basic_forces(A: FloatArray, wrench: FloatArray) -> FloatArray:
+    """Return a solution (n, 2) with only three forces that are not zero, those that A spans best: one of the many of (5.4).
+
+    What a solver of linear equations returns that seeks few numbers instead of small ones. It is here to compare with: wheels
+    that carry nothing stand beside wheels that carry all, and push against each other.
+    """
+    left, rows = A.T.copy(), []
+    for _ in range(3):
+        rows.append(int(np.argmax(np.sum(left * left, axis=0))))
+        direction = left[:, rows[-1]] / np.linalg.norm(left[:, rows[-1]])
+        left -= np.outer(direction, direction @ left)
+    force = np.zeros(len(A))
+    force[rows] = np.linalg.solve(A[rows].T, wrench)
+    return force.reshape(-1, 2)
+
+
 def weighted_forces(A: FloatArray, wrench: FloatArray, limit: FloatArray) -> FloatArray:
     """Return W A (A^T W A)^-1 F with W = diag(limit^2): every wheel as its hold allows, without a program to solve.
 

@@ -13,7 +13,7 @@ Three ways to do it, each a controller; the pseudo-inverse through A gives every
   that keeps both. Where the wrench cannot be made within the limits, the limits hold and the wrench falls short.
 
 * `JacobianPseudoInverse`: the least joint torques, through J = B^-1 A (fig. 5.7); it asks nothing of the ground, and is here
-  to be compared with.
+  to be compared with, as is `BasicSolution`: three forces carry everything.
 
 mu comes from the measurement (`friction`), or is that of the robot's ground; F_z is the robot's weight with the load that
 its own acceleration shifts, unless it is measured.
@@ -31,6 +31,7 @@ from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDes
 from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
 from .controller_interface import ControllerMeasurement, parameter
 from .force_distribution import (
+    basic_forces,
     friction_optimal_forces,
     jacobian_forces,
     limited_forces_kernel,
@@ -67,6 +68,15 @@ class JacobianPseudoInverse(ComputedTorque):
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
     ) -> tuple[ComputedTorqueState, FloatArray]:
         return state, jacobian_forces(demand.A, demand.wrench, self._B_inverse)
+
+
+class BasicSolution(ComputedTorque):
+    """Computed torque by three forces only; one of the solutions of (5.4) that has internal forces."""
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        return state, basic_forces(demand.A, demand.wrench)
 
 
 class _OnGround(ComputedTorque):

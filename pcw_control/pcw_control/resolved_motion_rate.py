@@ -31,7 +31,7 @@ from pcw_description.differential_kinematics import (
     joint_matrix_blocks,
     wheel_jacobian_kernel,
 )
-from pcw_description.robot_description import DRIVE, GRAVITY, STEER, FloatArray, RobotDescription
+from pcw_description.robot_description import STEER, FloatArray, RobotDescription
 
 from . import sliding_mode
 from .controller_interface import (
@@ -44,8 +44,11 @@ from .controller_interface import (
     internal_force_kernel,
     parameter,
 )
+from .delay_margin import derived_bandwidth, effective_mass, own_mass, tyre_resonance
 from .errors import ControlError
 from .reference_motion import MotionParameters, ReferenceMotion
+
+BANDWIDTH = 10.0  # w where delay allows it [rad/s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,14 +56,16 @@ class ResolvedMotionRateParameters(MotionParameters):
     """Gains of RMRC, of a unit mass: the effective mass of each wheel centre scales them.
 
     Attributes:
-        bandwidth: w, both poles of a wheel's velocity loop [rad/s].
+        bandwidth: w, both poles of a wheel's velocity loop [rad/s]; 0 derives it: 10 rad/s, or what bears 1 ms of delay.
         pose_bandwidth: how fast a pose error of a trajectory is taken back [1/s].
         slip_share: kappa, how much of the estimated slip is fed back (5.1) [1].
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"slip"})
 
-    bandwidth: float = parameter(10.0, "rad/s", "both poles of a wheel's velocity loop", above=0.0, maximum=200.0)
+    bandwidth: float = parameter(
+        0.0, "rad/s", "both poles of a wheel's velocity loop; 0 is 10 rad/s, or less where delay asks for it", maximum=200.0
+    )
     pose_bandwidth: float = parameter(3.0, "1/s", "how fast a pose error of a trajectory is taken back", maximum=50.0)
     slip_share: float = parameter(0.0, "1", "how much of the estimated slip is fed back, (5.1)", maximum=1.0)
 
@@ -108,25 +113,13 @@ class ResolvedMotionRateState:
     sliding: sliding_mode.SlidingModeState
 
 
-def effective_mass(robot: RobotDescription) -> FloatArray:
-    """Return what each wheel centre feels of the robot, along and across (n, 2) [kg]."""
+def settling_time(robot: RobotDescription, bandwidth: float, filter_time: float) -> FloatArray:
+    """Return T (n, 2) [s] of the sliding mode, at most eps; see `sliding_mode`."""
+    own, w_t = own_mass(robot), tyre_resonance(robot)
     share = robot.total_mass / robot.n
-    along = robot.armature[:, DRIVE, DRIVE] + [c.wheel.inertia_axle for c in robot.casters]
-    across = robot.armature[:, STEER, STEER] + [c.module.inertia_zz for c in robot.casters]
-    return np.stack([share + along / robot.wheel_radius**2, share + across / robot.caster_offset[:, 0] ** 2], axis=1)
-
-
-def settling_time(robot: RobotDescription, filter_time: float) -> FloatArray:
-    """Return T (n, 2) [s] of the sliding mode: 4 g / (eps w_t^2), at most eps; see `sliding_mode`.
-
-    w_t^2 = c (1 / m_w + n / m) with the stiffness of the tyre at small slip, c = 2 mu_p F_z / (lambda_p sigma).
-    """
-    share = robot.total_mass / robot.n
-    own = effective_mass(robot) - share
-    peak = np.array([[t.mu_p / t.lambda_p, t.lateral.mu_p / t.lateral.lambda_p] for t in robot.tyres])
-    stiffness = 2.0 * peak * share * GRAVITY / np.array([[t.relaxation_length] for t in robot.tyres])
-    resonance_squared = stiffness * (1.0 / own + 1.0 / share)
-    settling: FloatArray = np.minimum(4.0 * share / own / (filter_time * resonance_squared), filter_time)
+    by_mass = 4.0 * share / own / (filter_time * w_t**2)
+    by_gain = 2.0 / (bandwidth * filter_time * w_t)
+    settling: FloatArray = np.minimum(np.maximum(by_mass, by_gain), filter_time)
     return settling
 
 
@@ -149,7 +142,7 @@ class ResolvedMotionRate:
         self._B = joint_matrix_blocks(robot)
         self._reference_motion = ReferenceMotion(robot, self.parameters)
         self._mass = effective_mass(robot)
-        w = self.parameters.bandwidth
+        w = self.bandwidth = self.parameters.bandwidth or derived_bandwidth(robot, BANDWIDTH)
         self._k_p, self._k_i = 2.0 * w * self._mass, w * w * self._mass
         force_limit = robot.torque_limit / np.stack([robot.wheel_radius, np.abs(robot.caster_offset[:, 0])], axis=1)
         self._force_limit = force_limit
@@ -235,7 +228,7 @@ class SlidingModeRate(ResolvedMotionRate):
 
     def __init__(self, robot: RobotDescription, parameters: SlidingModeRateParameters | None = None) -> None:
         super().__init__(robot, parameters or SlidingModeRateParameters())
-        self._settling = settling_time(robot, self.parameters.filter_time)
+        self._settling = settling_time(robot, self.bandwidth, self.parameters.filter_time)
         self._gain = np.minimum(self.parameters.disturbance * self._mass, 0.5 * self._force_limit)
 
     def _discontinuous(
@@ -245,3 +238,8 @@ class SlidingModeRate(ResolvedMotionRate):
         return sliding_mode.step(
             p.law, state, error, u_c, self._mass, self._gain, p.filter_time, self._settling, p.boundary, saturated, dt
         )
+
+    def sliding_bound(self, dt: float) -> FloatArray:
+        """Return K T / m (n, 2) [m/s], within which s stays under the filtered law in steps of dt [s]."""
+        bound: FloatArray = self._gain * np.maximum(self._settling, dt) / self._mass
+        return bound

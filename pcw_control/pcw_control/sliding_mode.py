@@ -13,8 +13,9 @@ phase, and the mean of K sgn(s) is D. The motors get only that mean.
 A motor feels the robot through the tyre, a spring: above its resonance w_t the mass is only the wheel's own, m_w, and a
 law that counts on m is g = m / m_w - 1 times too strong. So sgn is replaced by sat(s m / (K T)): s stays within K T / m,
 and the loop over filter and s, g / (eps T w^2) there, stays below 1 / 4 from w_t on with T = 4 g / (eps w_t^2).
-`settling_time` derives it. The thesis writes s = -slip + z; with the motion wanted in place of the unknown true one,
--slip = A V - B q_dot is e.
+And what
+it adds stays below half of k_p there, T >= 4 m / (k_p eps w_t); `settling_time` derives it. The thesis writes s = -slip +
+z; with the motion wanted in place of the unknown true one, -slip = A V - B q_dot is e.
 """
 
 from __future__ import annotations

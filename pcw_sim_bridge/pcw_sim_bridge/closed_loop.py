@@ -103,5 +103,5 @@ def run_closed_loop(
             simulated.command(JointCommand(effort=torque))
     finally:
         simulated.close()
-    columns = list(zip(*rows))
-    return ClosedLoopRun(*(np.array(column) for column in columns[:-1]), states=columns[-1])
+    *columns, states = zip(*rows)
+    return ClosedLoopRun(*[np.array(column) for column in columns], tuple(states))  # type: ignore[arg-type]
