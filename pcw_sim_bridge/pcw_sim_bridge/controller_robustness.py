@@ -3,9 +3,9 @@
     python -m pcw_sim_bridge.controller_robustness [--runs 200] [--first 0] [--out pcw_control/docs/controller_robustness.md]
 
 Every run draws from its seed a robot (six kinds, three to six casters), a controller, headings of the wheels, three twists to
-follow, and errors of up to 20 % in every mass, inertia and friction coefficient. The plant has 1 ms of dead time in the drives.
-A run is unstable when a number is not finite, when the robot is further than 50 mm/s or 50 mrad/s (or a tenth of what is wanted)
-from its twist after 2 s of holding it, or when the torques then vary by more than a tenth of their limits.
+follow, and errors of up to 20 % in every mass, inertia and friction coefficient. The plant has 1 ms of dead time in the
+drives. A run is unstable when a number is not finite, when the robot is further than 50 mm/s or 50 mrad/s (or a tenth of what
+is wanted) from its twist after 2 s of holding it, or when the torques then vary by more than a tenth of their limits.
 """
 
 from __future__ import annotations

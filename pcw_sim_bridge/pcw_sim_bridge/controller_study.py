@@ -130,8 +130,8 @@ def figure_5_2(document: Document) -> None:
     document.add(
         f"A robot with {LOAD_MISMATCH:.0%} of load that nobody told the controller, at rest, is taken over at {STEP_SPEED} "
         f"m/s: that is the velocity error at the first sample. Chatter: RMS of all torques above {CHATTER_FROM:g} Hz. Bound "
-        "of s: K T / m for the filtered law, the layer phi for the boundary layer. The filtered law holds s at its bound where the "
-        "disturbance is more than K, and says for how long; the boundary layer is outside until it has reached.", "",
+        "of s: K T / m for the filtered law, the layer phi for the boundary layer. The filtered law holds s at its bound where "
+        "the disturbance is more than K, and says for how long; the boundary layer is outside until it has reached.", "",
     )
     rows, target = [], TwistReference(np.array([STEP_SPEED, 0.0, 0.0]))
     for robot_name in ROBOTS:
@@ -167,7 +167,8 @@ def figure_5_2(document: Document) -> None:
                 )
     document.table(
         ["robot", "plant", *(f"chatter, {law.replace('_', ' ')}" for law in SLIDING_LAWS), "filtered / plain",
-         "outside its bound: boundary layer", "outside: filtered", "largest s / bound, filtered", "at its bound: filtered"], rows,
+         "outside its bound: boundary layer", "outside: filtered", "largest s / bound, filtered",
+         "at its bound: filtered"], rows,
     )
     document.add("The thesis shows curves without numbers: both quiet, the boundary layer reaches late. Bar: 5 %.", "")
 
