@@ -103,8 +103,11 @@ def step(
         z = s - error
     else:
         z = state.auxiliary + dt / mass * (state.force - state.switched)
-        s = error + z
-        switched = np.clip(s * mass / np.maximum(settling, dt), -gain, gain)
+        bound = gain * np.maximum(settling, dt) / mass
+        # What D is more than K cannot be made up for and is not stored: s waits at its bound instead of winding up.
+        s = np.clip(error + z, -bound, bound)
+        z = s - error
+        switched = s * mass / np.maximum(settling, dt)
         filtered = state.filtered + (1.0 - math.exp(-dt / filter_time)) * (switched - state.filtered)
     u = continuous + filtered
     return SlidingModeState(z, filtered, switched, u, s), u

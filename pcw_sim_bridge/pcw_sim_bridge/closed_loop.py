@@ -104,4 +104,6 @@ def run_closed_loop(
     finally:
         simulated.close()
     *columns, states = zip(*rows)
-    return ClosedLoopRun(*[np.array(column) for column in columns], tuple(states))  # type: ignore[arg-type]
+    arrays = [np.array(column) for column in columns]
+    time, q, q_dot, tau, internal, V_d, odometric, pose, twist, slip = arrays
+    return ClosedLoopRun(time, q, q_dot, tau, internal, V_d, odometric, pose, twist, slip, tuple(states))
