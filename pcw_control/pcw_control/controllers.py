@@ -33,6 +33,7 @@ from .slip_constraint_force import (
     SlipConstraintForce,
     SlipConstraintForceParameters,
 )
+from .slip_ratio_limit import SlipRatioLimit, SlipRatioLimitParameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +82,9 @@ CONTROLLERS: dict[str, ControllerEntry] = {
     "friction_optimal_slip_constraint": ControllerEntry(
         FrictionOptimalSlipConstraint, FrictionOptimalSlipConstraintParameters,
         "shares the force as friction allows, with internal forces that hold slip",
+    ),
+    "slip_ratio_limit": ControllerEntry(
+        SlipRatioLimit, SlipRatioLimitParameters, "as slip_constraint_force, with every wheel's slip ratio kept in a band"
     ),
     "force_guided": ControllerEntry(
         ForceGuided, ForceGuidedParameters, "gives way to a measured push, with internal forces that hold slip (table 5.5)"

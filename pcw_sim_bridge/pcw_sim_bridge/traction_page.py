@@ -52,6 +52,11 @@ The thesis shows figs. 5.11 and 5.12 without a number. On good ground there is h
 because the tyres hold the wheels together far more stiffly than any control at this delay may; where a wheel has little
 grip, or all have none, the internal forces do it.
 """
+_COMMON_TEXT = """\
+All wheels on mu = 0.1, asked to speed up to 1 m/s and to stop at twice what the ground gives, torques 2 ms late. No way
+to share forces can help here. `slip_ratio_limit` keeps the slip ratios at 0.8 of the critical one (0.08), with the slip
+known from the truth: the robot then speeds up and brakes at what the ground gives.
+"""
 _RATIO_TEXT = """\
 One wheel with its share of the robot, on the catalogue's Kiencke curves, driven from 1 m/s and braked from 5 m/s to 1
 m/s; set-points are 0.2 and the ground's own critical slip ratio. RMS from 0.15 s on. Beyond the peak the force grows
@@ -158,6 +163,19 @@ def _ratio_table(data: Rows) -> list[str]:
     return [*lines, ""]
 
 
+def _common_table(data: Rows) -> list[str]:
+    lines = [
+        "| robot | controller | slip [mm/s] | largest slip ratio | speeds up at [m/s^2] | brakes at [m/s^2] |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for row in data:
+        lines.append(
+            f"| {row['robot']} | {row['controller']} | {1e3 * float(row['slip']):.1f} | {float(row['worst_ratio']):.3f} | "
+            f"{float(row['acceleration']):.2f} | {float(row['braking']):.2f} |"
+        )
+    return [*lines, ""]
+
+
 def _cost_table(data: Rows) -> list[str]:
     lines = ["| robot | controller | median [us] | p99 [us] | bar [us] | |", "|---|---|---:|---:|---:|---|"]
     for row in data:
@@ -233,6 +251,8 @@ def write_page(out: Path) -> None:
         _SLIP_TEXT, *shown["slip"], *_slip_tables(slip),
         "## Force-guided along a circle", "",
         _GUIDED_TEXT, *_guided_table(guided), *shown["guided"],
+        "## Slip that all wheels have in common", "",
+        _COMMON_TEXT, *_common_table(read(out / "traction_common.csv")),
         "## Slip ratio", "",
         _RATIO_TEXT, *_ratio_table(ratio), *shown["ratio"],
         "## Time of a control step", "",

@@ -1,10 +1,11 @@
 """All figures of what keeps traction, as data, plots and one page: `pcw_control/docs/traction.md`.
 
-    python -m pcw_sim_bridge.traction_study [--out pcw_control/docs] [--seeds 50] [--parts slip guided ratio cost]
+    python -m pcw_sim_bridge.traction_study [--out pcw_control/docs] [--seeds 50] [--parts slip guided common ratio cost]
 
-Each part writes its data as CSV; the page and the plots are made of whatever data is in the folder, so that parts can be run
-one by one. `slip` compares ways to share the force (`split_friction`), `guided` is a push along a circle (`guided_circle`),
-`ratio` holds slip ratios (`slip_ratio_runs`), `cost` measures the step of every controller.
+Each part writes its data as CSV; the page and the plots are made of whatever data is in the folder, so that parts can
+be run one by one. `slip` compares ways to share the force (`split_friction`), `guided` is a push along a circle
+(`guided_circle`), `common` asks all wheels for too much at once (`common_slip`), `ratio` holds slip ratios
+(`slip_ratio_runs`), `cost` measures the step of every controller.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from pcw_control.controllers import CONTROLLERS, make_controller
 from pcw_description.errors import PcwError
 from pcw_description.robot_file import load_robot
 
-from . import guided_circle, slip_ratio_runs, split_friction
+from . import common_slip, guided_circle, slip_ratio_runs, split_friction
 from .traction_page import write_page
 
-PARTS = ("slip", "guided", "ratio", "cost")
+PARTS = ("slip", "guided", "common", "ratio", "cost")
 Rows = Iterable[tuple[object, ...]]
 
 
@@ -101,6 +102,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 out / "traction_guided.csv", guided_circle.COLUMNS, guided_circle.rows(robot, options.seeds, plants),
                 lambda row: not (row["robot"] == robot and row["plant"] in plants),
             )  # fmt: skip
+        if "common" in options.parts:
+            write_csv(out / "traction_common.csv", common_slip.COLUMNS, common_slip.rows(), lambda row: False)
         if "ratio" in options.parts:
             write_csv(
                 out / "traction_ratio.csv", slip_ratio_runs.COLUMNS, slip_ratio_runs.rows(robot, options.seeds),

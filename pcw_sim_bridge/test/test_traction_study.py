@@ -7,7 +7,14 @@ import pytest
 
 from pcw_control.controllers import make_controller
 from pcw_description import load_robot
-from pcw_sim_bridge import guided_circle, slip_ratio_runs, split_friction, traction_page, traction_study
+from pcw_sim_bridge import (
+    common_slip,
+    guided_circle,
+    slip_ratio_runs,
+    split_friction,
+    traction_page,
+    traction_study,
+)
 
 ROBOT = load_robot("thesis")
 SEEDS = range(100, 103)  # not those that the page is written with
@@ -75,6 +82,17 @@ def test_wheels_of_a_guided_robot_turn_evenly_and_energy_stays_the_operators(gro
         assert score.least_energy >= -0.01 and score.given_back <= 0.01
         assert score.energy > 10.0
     assert spread["with"] <= 0.5 * spread["without"]
+
+
+@pytest.mark.parametrize("name", ["thesis", *(pytest.param(n, marks=pytest.mark.nightly) for n in common_slip.ROBOTS[1:])])
+def test_slip_that_all_wheels_have_in_common_is_limited_where_it_is_known(name):
+    """Asked for twice what the ground gives: a tenth of the slip, and most of what friction can do, driving and braking."""
+    robot = load_robot(name)
+    blind, limited = (common_slip.drive_and_brake(robot, method) for method in common_slip.METHODS)
+    assert limited.slip <= 0.2 * blind.slip
+    assert limited.worst_ratio <= 0.15 < blind.worst_ratio
+    for gained in (limited.acceleration, limited.braking):
+        assert gained >= 0.85 * 0.1 * 9.81
 
 
 @pytest.mark.parametrize("place", slip_ratio_runs.GROUNDS)
