@@ -160,11 +160,12 @@ def check_step(measurement: ControllerMeasurement, reference: Reference, dt: flo
         raise ControlError(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
     _require("joint_position", measurement.joint_position, (n, 2))
     _require("joint_velocity", measurement.joint_velocity, (n, 2))
-    for name, values, shape in (
+    optional = (
         ("slip", measurement.slip, (n, 2)), ("friction", measurement.friction, (n,)),
         ("critical_slip", measurement.critical_slip, (n,)), ("normal_force", measurement.normal_force, (n,)),
         ("external_wrench", measurement.external_wrench, (3,)),
-    ):
+    )
+    for name, values, shape in optional:
         if values is not None:
             _require(name, values, shape)
     if isinstance(reference, ForceReference):
@@ -179,8 +180,16 @@ def check_step(measurement: ControllerMeasurement, reference: Reference, dt: flo
 
 
 def _require(name: str, values: FloatArray, shape: Sequence[int]) -> None:
-    if values.shape != shape or not np.isfinite(values).all():
+    if values.shape != shape or not _all_finite(values.ravel()):
         raise ControlError(f"{name} = {values.tolist()} is not allowed; allowed: finite numbers, shape {tuple(shape)}")
+
+
+@compiled
+def _all_finite(values):  # type: ignore[no-untyped-def]
+    for k in range(len(values)):
+        if not math.isfinite(values[k]):
+            return False
+    return True
 
 
 def internal_forces(

@@ -17,6 +17,7 @@ import numpy as np
 from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .controller_interface import parameter
+from .delay_margin import derived_bandwidth
 from .resolved_motion_rate import ResolvedMotionRate, ResolvedMotionRateParameters
 
 
@@ -25,7 +26,8 @@ class CrossCouplingParameters(ResolvedMotionRateParameters):
     """Gains.
 
     Attributes:
-        coupling: c, how much stronger the difference between wheels is controlled than their common error [1].
+        coupling: c, how much stronger the difference between wheels is controlled than their common error; less where delay
+            asks for it [1].
     """
 
     coupling: float = parameter(
@@ -40,9 +42,12 @@ class CrossCoupling(ResolvedMotionRate):
 
     def __init__(self, robot: RobotDescription, parameters: CrossCouplingParameters | None = None) -> None:
         super().__init__(robot, parameters or CrossCouplingParameters())
+        # Wheels that move against each other feel 1 + c times the gain; it too has to bear the delay.
+        strongest = derived_bandwidth(robot, (1.0 + self.parameters.coupling) * self.bandwidth) / self.bandwidth
+        self.coupling = max(strongest - 1.0, 0.0)
 
     def _coupling(self, A: FloatArray, error: FloatArray, integral: FloatArray) -> FloatArray:
         errors = np.stack([error.ravel(), integral.ravel()], axis=1)
         relative = errors - A @ np.linalg.solve(A.T @ A, A.T @ errors)
         pull = self._k_p * relative[:, 0].reshape(-1, 2) + self._k_i * relative[:, 1].reshape(-1, 2)
-        return self.parameters.coupling * pull
+        return self.coupling * pull

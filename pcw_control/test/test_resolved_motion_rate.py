@@ -128,7 +128,7 @@ def test_takes_a_pose_error_back_along_a_trajectory():
 
 def test_cross_coupling_acts_on_the_difference_between_wheels_alone():
     """With one wheel behind, coupling adds force that moves nothing: A^T of it is zero; without a difference it adds none."""
-    plain, coupled = ResolvedMotionRate(THESIS), CrossCoupling(THESIS, CrossCouplingParameters(coupling=3.0))
+    plain, coupled = ResolvedMotionRate(THESIS), CrossCoupling(THESIS, CrossCouplingParameters(coupling=2.0))
     measurement = contract.rolling_measurement(THESIS, [0.2, 0.0, 0.0], np.zeros(4))
     reference = TwistReference(np.array([0.25, 0.0, 0.0]))
 
@@ -142,6 +142,12 @@ def test_cross_coupling_acts_on_the_difference_between_wheels_alone():
     added = forces(coupled, measured) - forces(plain, measured)
     assert added[0, 0] > 1.0 and added[1, 0] < 0.0
     np.testing.assert_allclose(added[:, 0].sum(), 0.0, atol=1e-9)  # equal masses, all ahead: no force on the robot
+
+
+def test_cross_coupling_is_no_stronger_than_delay_allows():
+    """TidyBot++ bears no more gain than RMRC has already; four random runs in seventeen swung before this was derived."""
+    assert CrossCoupling(THESIS).coupling == pytest.approx(2.0)
+    assert CrossCoupling(load_robot("tidybot2")).coupling == 0.0
 
 
 def test_parameters_are_refused_with_what_is_allowed():

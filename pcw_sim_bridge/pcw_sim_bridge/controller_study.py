@@ -129,9 +129,10 @@ def figure_5_2(document: Document) -> None:
     document.add("## Fig. 5.2: chattering, and the phase of reaching", "")
     document.add(
         f"A robot with {LOAD_MISMATCH:.0%} of load that nobody told the controller, at rest, is taken over at {STEP_SPEED} "
-        f"m/s: that is the velocity error at the first sample. Chatter: RMS of all torques above {CHATTER_FROM:g} Hz. Bound "
-        "of s: K T / m for the filtered law, the layer phi for the boundary layer. The filtered law holds s at its bound where "
-        "the disturbance is more than K, and says for how long; the boundary layer is outside until it has reached.", "",
+        f"m/s: that is the velocity error at the first sample. Chatter: RMS of all torques above {CHATTER_FROM:g} Hz. "
+        "Bound of s: K T / m for the filtered law, the layer phi for the boundary layer. The filtered law "
+        "holds s at its bound where the disturbance is more than K, and says for how long; the boundary layer is outside "
+        "until it has reached.", "",
     )
     rows, target = [], TwistReference(np.array([STEP_SPEED, 0.0, 0.0]))
     for robot_name in ROBOTS:

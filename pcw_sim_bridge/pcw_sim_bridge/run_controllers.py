@@ -17,7 +17,11 @@ from .plants.plant import PlantError
 from .sensors import JointReading
 from .simulated_robot import JointCommand
 
-CONTROLLER_NAMES = (*controllers.CONTROLLERS, "velocity_loops")
+# Nobody pushes the robot of a run, so those that give way to a push are left out.
+CONTROLLER_NAMES = (
+    *(name for name, entry in controllers.CONTROLLERS.items() if "external_wrench" not in entry.parameters.uses),
+    "velocity_loops",
+)
 
 
 class RunController(Protocol):
