@@ -379,6 +379,7 @@ def test_a_pushed_robot_lets_go_when_the_sensor_falls_silent_or_lies(ros):
     assert all(np.isfinite(command.effort).all() for command in robot.commands)
 
 
+@pytest.mark.nightly  # the core's test shows the limits; this one that the parameters reach it
 def test_power_and_jerk_are_limited_in_the_node(ros):
     ros.start(CONTROLLER, "-p", "drive_power:=2.0", "-p", "drive_jerk:=20.0")
     robot = Robot(ros)
@@ -396,3 +397,46 @@ def test_the_first_name_still_starts_it(ros):
     controller = ros.start("pcw_control.nodes.computed_torque", "-p", "autostart:=false")
     assert ros.call(GetState, "computed_torque/get_state").current_state.label == "unconfigured"
     assert controller.interrupt() == 0
+
+
+FAULTY = """
+import dataclasses
+import numpy as np
+from pcw_control.computed_torque import ComputedTorque
+from pcw_control.nodes import controller
+
+step = ComputedTorque.step
+
+def faulty(self, state, measurement, reference, dt):
+    state, output = step(self, state, measurement, reference, dt)
+    if reference.twist[2] == 2.0:
+        raise RuntimeError("a fault on purpose")
+    if reference.twist[2] == 1.0:
+        output = dataclasses.replace(output, torque=np.full((4, 2), np.nan))
+    return state, output
+
+ComputedTorque.step = faulty
+raise SystemExit(controller.main())
+"""
+
+
+def test_a_torque_that_is_no_number_lets_go_and_an_exception_latches(ros):
+    """A controller with two faults on purpose, chosen by the yaw rate that is wanted."""
+    ros.run([sys.executable, "-c", FAULTY])
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    robot.run(robot.drives)
+    robot.target = (0.3, 0.0, 1.0)
+    robot.run(robot.let_go)
+    ros.wait_for(lambda: "not finite" in warnings_of(diagnostics))
+    robot.target = (0.3, 0.0, 0.0)
+    robot.run(robot.drives)  # it lets go for as long as it lasts
+    robot.target = (0.3, 0.0, 2.0)
+    robot.run(robot.let_go)
+    ros.wait_for(lambda: "latched: RuntimeError: a fault on purpose" in warnings_of(diagnostics))
+    robot.target, count = (0.3, 0.0, 0.0), len(robot.commands)
+    robot.run(lambda: len(robot.commands) > count + 50)
+    assert not any(np.any(command.effort) for command in robot.commands[count:])
+    assert change_state(ros, Transition.TRANSITION_DEACTIVATE)
+    assert change_state(ros, Transition.TRANSITION_ACTIVATE)
+    robot.run(robot.drives)
+    assert all(np.isfinite(command.effort).all() for command in robot.commands)

@@ -16,7 +16,7 @@ from pcw_sim_bridge.controller_robustness import random_run
 from pcw_sim_bridge.controller_study import _TakenOver, chatter, incompatibility, overloaded, rms, straight
 
 
-@pytest.mark.parametrize("name", ["thesis", "dyros_pcv"])
+@pytest.mark.parametrize("name", ["thesis", pytest.param("dyros_pcv", marks=pytest.mark.nightly)])
 def test_the_filtered_sliding_mode_is_quiet_and_within_its_bound_from_the_first_sample(name):
     """Fig. 5.2: at most 5 % of the chatter of the plain law; |s| within 1.02 of its bound."""
     robot = load_robot(name)
@@ -32,7 +32,7 @@ def test_the_filtered_sliding_mode_is_quiet_and_within_its_bound_from_the_first_
     assert found["low_pass_integral"] <= 0.05 * found["plain"]
 
 
-@pytest.mark.parametrize("name", ["thesis", "tidybot2"])
+@pytest.mark.parametrize("name", ["thesis", pytest.param("tidybot2", marks=pytest.mark.nightly)])
 def test_sliding_mode_follows_closer_under_unknown_load(name):
     """Fig. 5.3: at most 0.35 of the error of RMRC."""
     robot = load_robot(name)
@@ -57,8 +57,13 @@ def test_least_internal_force_keeps_the_wheels_together():
     assert spreads[0] <= 0.5 * spreads[1]
 
 
-@pytest.mark.parametrize("seed", range(300, 300 + len(CONTROLLERS)))
-def test_random_runs_are_stable(seed):
+DAILY = ("cross_coupling", "sliding_mode_rate", "slip_constraint_force")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in DAILY else pytest.mark.nightly) for name in CONTROLLERS]
+)
+def test_random_runs_are_stable(name):
     """One of each controller; 200 are made by `controller_robustness`."""
-    outcome = random_run(seed)
+    outcome = random_run(300, names=(name,))
     assert not outcome.unstable, outcome
