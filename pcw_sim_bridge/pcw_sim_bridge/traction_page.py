@@ -40,10 +40,11 @@ printed (clip), the weighted pseudo-inverse and the QP are told friction and loa
 
 The thesis shows fig. 5.9 without a number: slip detected without SCFC, zero with it. What the figure cannot show: below
 the limit there is only creep to reduce. On uniform ground nearly all of it is needed to make the force at all: a wheel
-of this tyre that uses the part u of its hold creeps at the slip ratio lambda_p (1 - sqrt(1 - u^2)) / u, for the whole
-quintic 13 to 20 mm/s RMS at 0.6 to 0.85, and 27 mm/s at 1. What SCFC takes away there is what the wheels push against
-each other, and no way to share forces can go below the creep; a pseudo-inverse that does not run away cannot be beaten
-by a factor of twenty. Slip that all wheels have in common is not seen by encoders.
+of this tyre that uses the part u of its hold creeps at the slip ratio lambda_p (1 - sqrt(1 - u^2)) / u, which for the
+whole quintic is 13 to 20 mm/s RMS at 0.6 to 0.85, and 27 mm/s at 1, less what the force spends on the wheels' own inertia
+and what the tyre's relaxation holds back. What SCFC takes away there is what the wheels push against each other. Where the
+pseudo-inverse does not run away far, creep is more than a twentieth of its slip, and no way to share forces meets that bar.
+Slip that all wheels have in common is not seen by encoders.
 """
 _GUIDED_TEXT = """\
 A push of 20 N turns round once in six seconds. Spread is how far the rolling speeds are from those of one rigid motion,
@@ -58,6 +59,9 @@ _COMMON_TEXT = """\
 All wheels on mu = 0.1, asked to speed up to 1 m/s and to stop at twice what the ground gives, torques 2 ms late. No way
 to share forces can help here. `slip_ratio_limit` keeps the slip ratios at 0.8 of the critical one (0.08), with the slip
 known from the truth: the robot then speeds up and brakes at what the ground gives.
+"""
+_COST_TEXT = """\
+CPU time of the thread, four casters, measurements drawn anew for every step. To be run on a machine that does nothing else.
 """
 _RATIO_TEXT = """\
 One wheel with its share of the robot, on the catalogue's Kiencke curves, driven from 1 m/s and braked from 5 m/s to 1
@@ -259,8 +263,7 @@ def write_page(out: Path) -> None:
         _COMMON_TEXT, *_common_table(read(out / "traction_common.csv")),
         "## Slip ratio", "",
         _RATIO_TEXT, *_ratio_table(ratio), *shown["ratio"],
-        "## Time of a control step", "",
-        "CPU time of the thread, four casters, measurements drawn anew for every step.", "",
-        *_cost_table(cost),
     ]  # fmt: skip
+    if cost:
+        lines += ["## Time of a control step", "", _COST_TEXT, *_cost_table(cost)]
     (out / "traction.md").write_text("\n".join(lines).rstrip() + "\n")
