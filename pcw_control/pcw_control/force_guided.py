@@ -44,6 +44,7 @@ from .controller_interface import (
     parameter,
 )
 from .errors import ControlError
+from .force_distribution import solve_kernel
 from .reference_motion import _largest_joint_speed
 from .slip_constraint_force import SlipConstraintForce, SlipConstraintParameters
 
@@ -192,13 +193,13 @@ class UnifiedForceMotion(ComputedTorque):
             before.guided_twist, before.impulse, before.energy, push, wanted, V, known, self.virtual_mass, self._follows,
             self._numbers, demand.A, self._B_inverse, self._speed_limit, dt,
         )  # fmt: skip
-        V_f_dot = np.minimum(np.maximum((V_f - before.guided_twist) / dt, -self._largest_change), self._largest_change)
-        F_f = V_f_dot + self.parameters.tracking_gain * (V_f - V)
         _, theta = self._model.evaluate(demand.steer_angle, V)
-        F_m = np.linalg.solve(demand.inertia, demand.wrench - theta)
-        F_u = demand.inertia @ np.where(self._follows > 0.0, F_f, F_m) + theta - push
+        F_u, followed = _unified_force(
+            demand.wrench, demand.inertia, theta, push, V, V_f, before.guided_twist, state.reference_twist, self._follows,
+            self._largest_change, self.parameters.tracking_gain, dt,
+        )  # fmt: skip
         state = dataclasses.replace(
-            before, reference_twist=np.where(self._follows > 0.0, V_f, state.reference_twist),
+            before, reference_twist=followed,
             error_integral=state.error_integral, guided_twist=V_f, impulse=impulse, energy=energy,
         )  # fmt: skip
         return state, dataclasses.replace(demand, wrench=F_u)
@@ -220,6 +221,37 @@ class ForceGuided(SlipConstraintForce, UnifiedForceMotion):
 
     def __init__(self, robot: RobotDescription, parameters: ForceGuidedParameters | None = None) -> None:
         super().__init__(robot, parameters or ForceGuidedParameters())  # type: ignore[arg-type]
+
+
+@compiled
+def _unified_force(  # type: ignore[no-untyped-def]
+    F, inertia, theta, push, V, V_f, V_f_before, V_d, follows, largest_change, gain, dt
+):
+    """Return F_u (3,) and the twist that is followed (3,): Lambda (Omega F_m + (I - Omega) F_f) + theta + F_sensor.
+
+    F = Lambda F_m + theta is what computed torque asks for.
+    """
+    right, F_f, followed = np.empty(3), np.zeros(3), V_d.copy()
+    guided = False
+    for i in range(3):
+        right[i] = F[i] - theta[i]
+        if follows[i] > 0.0:
+            change = min(max((V_f[i] - V_f_before[i]) / dt, -largest_change[i]), largest_change[i])
+            F_f[i] = change + gain * (V_f[i] - V[i])
+            followed[i] = V_f[i]
+            guided = True
+    if not guided:
+        return F - push, followed
+    acceleration = solve_kernel(inertia, right)
+    F_u = np.empty(3)
+    for i in range(3):
+        if follows[i] > 0.0:
+            acceleration[i] = F_f[i]
+    for i in range(3):
+        F_u[i] = theta[i] - push[i]
+        for j in range(3):
+            F_u[i] += inertia[i, j] * acceleration[j]
+    return F_u, followed
 
 
 @compiled

@@ -10,7 +10,7 @@ seen at the contact, M = B^-T diag(...) B^-1, and steering has several times mor
     f = -K (e + w_i int e dt),      K = w_s M,      e = (I - Q) B q_dot,      Q = A (A^T K A)^-1 A^T K
 
 so that e_dot = -w_s e of a wheel without grip, for every robot and in every direction of e; w_s follows from the delay of
-the loop, w_s = PHASE / delay. With K = k_p I it is the thesis's law, as then Q = A A^+.
+the loop, w_s = PHASE / delay, and w_i is a part of it. With K = k_p I it is the thesis's law, as then Q = A A^+.
 
 * (I - Q) A = 0, so e = (I - Q) eps whatever V is: encoders see e, and nothing else is needed. What they do not see is slip
   that all wheels have in common, as a rigid motion.
@@ -39,8 +39,9 @@ from .controller_interface import ControllerMeasurement, ControllerParameters, p
 from .force_distribution import solve_kernel
 from .friction_sharing import FrictionOptimal, FrictionParameters
 
-# Phase that the delay may take from the loop of a wheel without grip [rad]; pi/2 is where it would swing on its own. It
-# leaves a margin of 65 degrees, and k_p = 400 N s/m along for the thesis's robot of 90 kg at 500 Hz.
+# Phase that the delay may take from the loop of a wheel without grip [rad]; pi/2 is where it would swing on its own. With the
+# 14 degrees of an integral a quarter as fast it leaves a margin of 50 degrees, and k_p = 400 N s/m along for the thesis's
+# robot of 90 kg at 500 Hz.
 PHASE = 0.45
 
 
@@ -51,14 +52,14 @@ class SlipConstraintParameters(ControllerParameters):
     Attributes:
         loop_delay: from a motion of the wheel to the torque that answers it, beyond the control period [s].
         proportional_gain: k_p, the same in all directions as the thesis has it [N s/m]; 0: from inertia and delay.
-        integral_rate: w_i = k_i / k_p [1/s]; 0: proportional only.
+        integral_ratio: w_i / w_s, with w_i = k_i / k_p [1]; 0: proportional only.
         integral_memory: time constant after which the integral has forgotten [s].
         integral_share: what the integral may ask for, as part of the force that the motors' torque limits give [1].
     """
 
     loop_delay: float = parameter(0.002, "s", "delay of the loop beyond the control period", maximum=0.1)
     proportional_gain: float = parameter(0.0, "N s/m", "force per slip velocity; 0: derived from inertia and delay")
-    integral_rate: float = parameter(10.0, "1/s", "integral gain relative to the proportional one; 0: none", maximum=1e3)
+    integral_ratio: float = parameter(0.25, "1", "rate of the integral relative to that of the loop; 0: none", maximum=1.0)
     integral_memory: float = parameter(0.5, "s", "time constant after which the integral forgets", above=0.0)
     integral_share: float = parameter(0.5, "1", "largest integral force relative to the motors' limits", maximum=1.0)
 
@@ -82,6 +83,11 @@ def contact_inertia(robot: RobotDescription) -> FloatArray:
     return seen
 
 
+def loop_rate(robot: RobotDescription, parameters: SlipConstraintParameters) -> float:
+    """Return w_s = PHASE / delay [1/s], the control period being a part of the delay."""
+    return PHASE / (parameters.loop_delay + 1.0 / robot.sensors.encoders.rate)
+
+
 def slip_gains(robot: RobotDescription, parameters: SlipConstraintParameters) -> FloatArray:
     """Return K, force per slip velocity of every wheel, (n, 2, 2) [N s/m].
 
@@ -91,8 +97,7 @@ def slip_gains(robot: RobotDescription, parameters: SlipConstraintParameters) ->
     if parameters.proportional_gain > 0.0:
         robot.require_torque_control()
         return np.tile(parameters.proportional_gain * np.eye(2), (robot.n, 1, 1))
-    delay = parameters.loop_delay + 1.0 / robot.sensors.encoders.rate
-    return contact_inertia(robot) * (PHASE / delay)
+    return contact_inertia(robot) * loop_rate(robot, parameters)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +131,7 @@ class SlipConstraintLaw:
         self._B = joint_matrix_blocks(robot)
         strongest = np.einsum("nji,nj->ni", np.abs(np.linalg.inv(self._B)), robot.torque_limit)
         self._largest = p.integral_share * strongest
-        self._numbers = np.array([p.integral_rate, p.integral_memory])
+        self._numbers = np.array([p.integral_ratio * loop_rate(robot, p), p.integral_memory])
 
     def initial_state(self) -> FloatArray:
         """Return the state at the start: nothing has slipped."""

@@ -52,7 +52,8 @@ def cost_rows(robot_name: str, cycles: int = 3000) -> Rows:
         for cycle in range(cycles + 500):
             measured = ControllerMeasurement(
                 rng.normal(0.0, 1.0, (robot.n, 2)), rng.normal(0.0, 1.0, (robot.n, 2)), np.zeros(3),
-                friction=rng.uniform(0.1, 0.8, robot.n), external_wrench=rng.normal(0.0, 10.0, 3),
+                slip=rng.normal(0.0, 0.1, (robot.n, 2)), friction=rng.uniform(0.1, 0.8, robot.n),
+                external_wrench=rng.normal(0.0, 10.0, 3),
             )  # fmt: skip
             started = time.thread_time_ns()
             state, _ = controller.step(state, measured, TwistReference(np.array([0.5, 0.1, 0.2])), 0.002)
