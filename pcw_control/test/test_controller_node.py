@@ -409,9 +409,10 @@ step = ComputedTorque.step
 
 def faulty(self, state, measurement, reference, dt):
     state, output = step(self, state, measurement, reference, dt)
-    if reference.twist[2] == 2.0:
+    yaw_rate = getattr(reference, "twist", np.zeros(3))[2]
+    if yaw_rate == 2.0:
         raise RuntimeError("a fault on purpose")
-    if reference.twist[2] == 1.0:
+    if yaw_rate == 1.0:
         output = dataclasses.replace(output, torque=np.full((4, 2), np.nan))
     return state, output
 

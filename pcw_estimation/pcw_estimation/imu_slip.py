@@ -9,17 +9,23 @@ wheels which agree with it correct. With the velocity u of the place r of the IM
     pose_dot = R(yaw) v, omega          V_ext = (v, omega)
 
 with the biases b and what a floor that is not quite level leaves of gravity, t, which needs no derivative of the gyro. State:
-pose (3), u (2), b_g, b_a (2), t (2); and errors that stay what they are and are never learned, only kept in the covariance (a
-Schmidt filter): of the common wheel radius, of the mean steering zero, of the scales of the gyro and of both accelerometers,
-of the place of the IMU and of its clock. As noise they would be averaged out in a long turn, and V_ext be thought to know the
+pose (3), u (2), b_g, b_a (2), t (2), s_g; and errors that stay what they are and are never learned, only kept in the
+covariance (a Schmidt filter): of the common wheel radius, of the mean steering zero, of the scales of both accelerometers, of
+the place of the IMU and of its clock. As noise they would be averaged out in a long turn, and V_ext be thought to know the
 turning rate from the centripetal acceleration better than any scale allows.
 
+The turning rate of wheels with errors of radius, heading and place is wrong in proportion to the motion,
+
+    omega_wheels = omega + k_x v_x + k_y v_y + k_omega omega,
+
+and the three k are such errors as well. Where wheels slip and are left out, those that remain have other k; their turning rate
+then counts as one measurement per `MOTION_MEMORY`.
+
 A correction looks for the set of components that slips as `slip_consensus` does, with V_ext and its covariance as what is
-known before, and without a limit to what that may cost: if V_ext says so all wheels slip. What does not slip corrects v. The
-turning rate of wheels with errors of geometry is wrong by the same for as long as the motion stays alike, so it counts as one
-measurement per `MOTION_MEMORY`; a robot whose joints stand still does not turn, and that counts in full (b_g and b_a are
-learned at standstill). A tyre that accelerates the robot creeps, by lambda_p / (2 mu_p g) of speed and acceleration; that
-error lasts as long as an acceleration and is weighted accordingly.
+known before, and without a limit to what that may cost: if V_ext says so all wheels slip. What does not slip corrects v. A
+robot whose joints stand still does not turn, and that counts in full (b_g and b_a are learned at standstill). A tyre that
+accelerates the robot creeps, by lambda_p / (2 mu_p g) of speed and acceleration; that error lasts as long as an acceleration
+and is weighted accordingly.
 
 Where the wheels agree with each other for `yield_time`, but not with V_ext, they are believed: a ramp tilts gravity into the
 accelerometer, and no IMU of this kind can hold a velocity for long.
@@ -53,7 +59,7 @@ from .slip_verdict import (
     finding_of,
 )
 
-# How long an error of geometry stays the same before the motion is another one [s].
+# How long an error of the geometry of a few wheels stays the same before the motion is another one [s].
 MOTION_MEMORY = 10.0
 # Joints that stand are those of a robot that stands, or slides with blocked wheels; not for longer than this [s].
 STANDING_YIELD = 1.0
@@ -62,7 +68,7 @@ RETURN_SHARE = 0.5
 # Variance of a velocity over that with all wheels: above the first the errors of geometry that it holds are other ones than
 # those of all wheels, above the second the wheels do not tell that velocity.
 AMPLIFIED, TOLD = 6.0, 25.0
-# How long an acceleration lasts, and the creep of a tyre with it [s].
+# How long an acceleration lasts, and the creep of a tyre with it, and slip that is too small to be told [s].
 CREEP_MEMORY = 0.3
 # A robot stands when no encoder has moved by more than this for so long [counts], [s].
 STANDING_COUNTS, STANDING_TIME = 1.5, 0.1
@@ -74,15 +80,18 @@ TILT_WALK = 0.1
 GYRO_NOISE, ACCELEROMETER_NOISE, IMU_RATE = 0.002, 0.02, 200.0
 
 X, Y, YAW, UX, UY, GYRO_BIAS, BIAS_X, BIAS_Y, TILT_X, TILT_Y = range(10)
-RADIUS, HEADING, GYRO_SCALE, SCALE_X, SCALE_Y, PLACE_X, PLACE_Y, LATENESS = range(10, 18)
-_STATES, _LEARNED = 18, 10
-# Layout of the state, one array because two control loops pass it on: state of the filter (18) and its covariance (324); sums
+GYRO_SCALE, RADIUS, HEADING, SCALE_X, SCALE_Y, PLACE_X, PLACE_Y, LATENESS = range(10, 18)
+SPIN_X, SPIN_Y, SPIN_TURN = range(18, 21)  # k_x, k_y [1/m], k_omega [1]
+_STATES, _LEARNED = 21, 11
+# Layout of the state, one array because two control loops pass it on: state of the filter (21) and its covariance (441); sums
 # of the gyro and of the accelerometer's axes since the last correction and their number; the last sample (3); its age [s];
 # last turning rate [rad/s]; time since any joint moved, time for which the wheels have agreed against V_ext [s]; set of
 # slipping components, measurements since it was searched for, its lead; whether a velocity is known, and whether the wheels
 # told it last; then by caster where the joints stood, flags, and for how long they have been contradicted.
-_P, _SUMS, _SAMPLES, _LAST, _IMU_AGE, _OMEGA, _STANDING, _AGAINST = 18, 342, 345, 346, 349, 350, 351, 352
-_CHOSEN, _SINCE_SEARCH, _LEAD, _STARTED, _TOLD, _JOINTS = 353, 354, 355, 356, 357, 358
+_P = _STATES
+_SUMS = _P + _STATES**2
+_SAMPLES, _LAST, _IMU_AGE, _OMEGA, _STANDING, _AGAINST = _SUMS + 3, _SUMS + 4, _SUMS + 7, _SUMS + 8, _SUMS + 9, _SUMS + 10
+_CHOSEN, _SINCE_SEARCH, _LEAD, _STARTED, _TOLD, _JOINTS = (_SUMS + k for k in range(11, 17))
 _CONSISTENT, _SLIP, _CANNOT_KNOW = int(Verdict.CONSISTENT), int(Verdict.SLIP), int(Verdict.CANNOT_KNOW)
 
 
@@ -167,8 +176,9 @@ class ImuSlip:
             [
                 0.0, 0.0, 0.0, 1.0, 1.0, tolerance["imu.gyro_bias"] ** 2,
                 *2 * [tolerance["imu.accelerometer_bias"] ** 2], *2 * [(GRAVITY * slope) ** 2],
-                tolerance["wheel_radius"] ** 2 / n, tolerance["steer_zero"] ** 2 / n,
-                *3 * [tolerance["imu.scale"] ** 2], *2 * [tolerance["imu.position"] ** 2], tolerance["clock.offset"] ** 2,
+                tolerance["imu.scale"] ** 2, tolerance["wheel_radius"] ** 2 / n, tolerance["steer_zero"] ** 2 / n,
+                *2 * [tolerance["imu.scale"] ** 2], *2 * [tolerance["imu.position"] ** 2], tolerance["clock.offset"] ** 2,
+                *spin_factor_variance(robot),
             ]
         )  # fmt: skip
         self._imu_numbers = np.array(
@@ -272,6 +282,33 @@ class ImuSlip:
         return state, Motion(finding, state[:3], covariance[:3, :3], all_slip, told, inertial, float(state[GYRO_BIAS]))
 
 
+def spin_factor_variance(robot: RobotDescription) -> FloatArray:
+    """Return the variances of k_x, k_y and k_omega (3,) [1/m^2], [1/m^2], [1] that the robot's tolerances leave.
+
+    With the places p_i of the wheels about their centre, off by d_i, radii off by shares rho_i, steering zeros by zeta_i, and
+    all wheels of one weight:
+
+        omega_wheels - omega = sum p_i x ((rho_i + zeta_i J) (v + omega J p_i) + omega J d_i) / sum |p_i|^2
+    """
+    place = robot.steer_axis - robot.steer_axis.mean(axis=0)
+    square = np.sum(place**2, axis=1)
+    total = float(square.sum())
+    length = {name: robot.tolerance(name) for name in ("wheel_radius", "steer_axis", "caster_offset")}
+    radius = length["wheel_radius"].value / (1.0 if length["wheel_radius"].relative else float(robot.wheel_radius.min()))
+    axis = length["steer_axis"].value * (math.sqrt(total / robot.n) if length["steer_axis"].relative else 1.0)
+    offset = length["caster_offset"].value
+    offset *= float(np.abs(robot.caster_offset).max()) if length["caster_offset"].relative else 1.0
+    zero = robot.tolerance("steer_zero").value
+    spin: FloatArray = np.array(
+        [
+            np.sum((radius * place[:, 1]) ** 2 + (zero * place[:, 0]) ** 2) / total**2,
+            np.sum((radius * place[:, 0]) ** 2 + (zero * place[:, 1]) ** 2) / total**2,
+            radius**2 * np.sum(square**2) / total**2 + (axis**2 + offset**2) / total,
+        ]
+    )
+    return spin
+
+
 _TOLERANCES = (
     "wheel_radius", "steer_zero", "imu.gyro_bias", "imu.accelerometer_bias", "imu.scale", "imu.position", "clock.offset",
     "ground.slope",
@@ -286,8 +323,14 @@ _START_SPEED, _START_GYRO, _START_BIAS = 23, 24, 25
 
 @compiled
 def covariance_of(state):  # type: ignore[no-untyped-def]
-    """Return the covariance (18, 18) of the state of the filter."""
+    """Return the covariance (21, 21) of the state of the filter."""
     return state[_P:_SUMS].copy().reshape((_STATES, _STATES))
+
+
+@compiled
+def _turning_rate(state, gyro):  # type: ignore[no-untyped-def]
+    """Return the turning rate [rad/s] behind a reading of the gyro."""
+    return (gyro - state[GYRO_BIAS]) * (1.0 - state[GYRO_SCALE])
 
 
 @compiled
@@ -311,15 +354,18 @@ def _carry_on_by_imu(state, numbers, dt):  # type: ignore[no-untyped-def]
     gyro, ax, ay = state[_LAST], state[_LAST + 1], state[_LAST + 2]
     _carry_on(
         state, gyro, ax, ay, dt, numbers[_RX], numbers[_RY], numbers[_GYRO_NOISE] ** 2 * numbers[_PERIOD] * dt,
-        numbers[_ACCELEROMETER_NOISE] ** 2 * numbers[_PERIOD] * dt, numbers[_TILT], True,
+        numbers[_ACCELEROMETER_NOISE] ** 2 * numbers[_PERIOD] * dt, numbers[_TILT], True, np.zeros(3),
     )
 
 
 @compiled
-def _carry_on(state, gyro, ax, ay, dt, rx, ry, yaw_variance, speed_variance, tilt, by_imu):  # type: ignore[no-untyped-def]
-    """Carry state and covariance on by dt in place; P <- F P F^T + Q with the few entries of F that are not the identity's."""
+def _carry_on(state, gyro, ax, ay, dt, rx, ry, yaw_variance, speed_variance, tilt, by_imu, spun):  # type: ignore[no-untyped-def]
+    """Carry state and covariance on by dt in place; P <- F P F^T + Q with the few entries of F that are not the identity's.
+
+    `spun` (3,) is what a turning rate of the wheels is wrong by per k_x, k_y and k_omega.
+    """
     yaw, ux, uy = state[YAW], state[UX], state[UY]
-    omega = gyro - state[GYRO_BIAS]
+    omega = _turning_rate(state, gyro)
     vx, vy = ux + omega * ry, uy - omega * rx
     middle = yaw + 0.5 * omega * dt
     c, s = math.cos(middle), math.sin(middle)
@@ -346,6 +392,8 @@ def _carry_on(state, gyro, ax, ay, dt, rx, ry, yaw_variance, speed_variance, til
         f[YAW, GYRO_BIAS], f[YAW, GYRO_SCALE] = -dt, -omega * dt
         f[UX, UY], f[UX, GYRO_BIAS], f[UX, GYRO_SCALE], f[UX, BIAS_X] = omega * dt, -uy * dt, -omega * uy * dt, -dt
         f[UY, UX], f[UY, GYRO_BIAS], f[UY, GYRO_SCALE], f[UY, BIAS_Y] = -omega * dt, ux * dt, omega * ux * dt, -dt
+    for i in range(3):
+        f[YAW, SPIN_X + i] = -spun[i] * dt
     half = np.empty((5, _STATES))
     for i in range(5):
         for j in range(_STATES):
@@ -487,7 +535,7 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
     gyro_variance = numbers[_GYRO_NOISE] ** 2 / max(samples, 1.0)
     reference = np.zeros(3)
     if started:
-        reference[2] = gyro - state[GYRO_BIAS] if inertial else state[_OMEGA]
+        reference[2] = _turning_rate(state, gyro) if inertial else state[_OMEGA]
         reference[0], reference[1] = state[UX] + reference[2] * ry, state[UY] - reference[2] * rx
     variance, white = variance_kernel(caster_offset, wheel_radius, velocity, sensed, reference[2], noise)
     offset = np.empty(2 * n)
@@ -547,10 +595,19 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
     if rank:
         wheels[2] = reference[2] + solve(total, np.zeros(6), False)[3] / reach
     spin_variance = full_inverse(total)[2, 2] / reach**2 if rank else (numbers[_TRACTION] / reach) ** 2
+    # All wheels: what their geometry does to the turning rate is in the state; what slip is too small to be told is not.
+    spun, passing = np.zeros(3), spin_variance * 2.0 * MOTION_MEMORY / max(dt, 1e-9)
+    if chosen == 0 and rank and dt > 0.0:
+        spun[:] = wheels
+        brief = white.copy()
+        for i in range(n):
+            for j in range(2):
+                brief[i, j] += (variance[i, j] - white[i, j]) * 2.0 * CREEP_MEMORY / dt
+        passing = full_inverse(sum_of(parts_of_rows(rows, offset, brief), 0))[2, 2] / reach**2
     if not inertial and started:
         _carry_on(
-            state, wheels[2] + state[GYRO_BIAS], 0.0, 0.0, dt, rx, ry, spin_variance * 2.0 * MOTION_MEMORY * dt,
-            (numbers[_TRACTION] * dt) ** 2, numbers[_TILT], False,
+            state, wheels[2] / (1.0 - state[GYRO_SCALE]) + state[GYRO_BIAS], 0.0, 0.0, dt, rx, ry, passing * dt * dt,
+            (numbers[_TRACTION] * dt) ** 2, numbers[_TILT], False, spun,
         )  # fmt: skip
     if usable:
         quiet = sum_of(parts_of_rows(rows, offset, white), chosen)
@@ -562,7 +619,7 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
             slow = 2.0 * CREEP_MEMORY / dt * crept * crept
         for k in range(2):
             c, s = axes[k, 0], axes[k, 1]
-            omega = gyro - state[GYRO_BIAS] if inertial else wheels[2]
+            omega = _turning_rate(state, gyro) if inertial else wheels[2]
             difference = c * (wheels[0] - state[UX] - omega * ry) + s * (wheels[1] - state[UY] + omega * rx)
             known = c * c * exact[0, 0] + 2.0 * c * s * exact[0, 1] + s * s * exact[1, 1] + slow
             if dt > 0.0:
@@ -577,13 +634,11 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
             _learn(state, row, state[GYRO_BIAS] - gyro, gyro_variance)
         elif rank:
             row[GYRO_SCALE] = -reference[2]
-            _learn(
-                state, row, wheels[2] - gyro + state[GYRO_BIAS],
-                gyro_variance + spin_variance * 2.0 * MOTION_MEMORY / dt,
-            )  # fmt: skip
+            row[SPIN_X : SPIN_TURN + 1] = spun
+            _learn(state, row, wheels[2] - _turning_rate(state, gyro), gyro_variance + passing)
     if rank and told:
         state[_STARTED] = 1.0
-    omega = gyro - state[GYRO_BIAS] if inertial else wheels[2]
+    omega = _turning_rate(state, gyro) if inertial else wheels[2]
     reference[0], reference[1], reference[2] = state[UX] + omega * ry, state[UY] - omega * rx, omega
     state[_OMEGA] = omega
     matrix = state[_P:_SUMS].reshape((_STATES, _STATES))

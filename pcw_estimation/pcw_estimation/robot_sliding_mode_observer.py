@@ -51,6 +51,7 @@ from .sliding_mode_observer import (
     ACCURACY_FLOOR,
     ANGLE_ONLY,
     BANDWIDTH,
+    CONTRADICTION_FLOOR,
     LAYER,
     LEARNING_MEMORY,
     SETTLED_TIME_CONSTANTS,
@@ -88,6 +89,11 @@ LEAST_LOAD = 0.05
 # Directions of motion that the trusted wheels do not determine are left alone by a ridge of this size.
 RIDGE = 1e-3
 
+# Forces and accelerations are compared over a time, where the robot accelerates by at least so much [s], [m/s^2]. Where they
+# part for most of a longer time [s] it is no wheel that spins.
+COMPARED_TIME, LEAST_ACCELERATION = 0.05, 0.1
+MISMATCH_TIME, MISMATCH_SHARE = 3.0, 0.7
+
 # No robot on casters is faster, or turns faster [m/s], [rad/s].
 FASTEST, FASTEST_TURNING = 100.0, 300.0
 
@@ -96,7 +102,8 @@ _DRIVE, _STEER, _QUIET, _TRUST, _DRIVE_ERROR, _STEER_ERROR, _FX, _FY, _FZ = 0, 3
 _RUNS_X, _RUNS_Y, _TORQUE = 13, 14, 15
 _WHEEL_STATE = 16
 _COUNT, _TIME, _V, _A, _BOUND, _LEARNED_MM, _LEARNED_MA, _LATE = 0, 1, 2, 5, 8, 9, 10, 11
-_BODY_STATE = 12
+_COMPARED_MM, _COMPARED_MA, _MISMATCH = 12, 13, 14
+_BODY_STATE = 15
 _SPEED, _LOAD = 1, 2
 _ROOT_X, _ROOT_Y, _SENSED_X, _SENSED_Y, _ERROR_OF_ROOT, _FADE, _SEEN, _MODELLED = range(8)
 
@@ -266,6 +273,7 @@ def _advance(  # type: ignore[no-untyped-def]
         if trust > 0.0:
             least_error = min(least_error, error_of_root)
             trusted += 1
+    _compare(numbers, body, part, dt)
     body[_LEARNED_MM] *= math.exp(-dt / LEARNING_MEMORY)
     body[_LEARNED_MA] *= math.exp(-dt / LEARNING_MEMORY)
     if trusted > 0:
@@ -309,12 +317,37 @@ def _advance(  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _compare(numbers, body, part, dt):  # type: ignore[no-untyped-def]
+    """Follow in place for which part of the time the wheels accelerate more (or less) than the forces explain."""
+    fade = math.exp(-dt / COMPARED_TIME)
+    mm, ma = 0.0, 0.0
+    for i in range(len(part)):
+        mm += part[i, _MODELLED] ** 2 / len(part)
+        ma += part[i, _MODELLED] * part[i, _SEEN] / len(part)
+    body[_COMPARED_MM] += (1.0 - fade) * (mm - body[_COMPARED_MM])
+    body[_COMPARED_MA] += (1.0 - fade) * (ma - body[_COMPARED_MA])
+    if body[_COMPARED_MM] > LEAST_ACCELERATION**2:
+        parted = math.log(max(body[_COMPARED_MA], 1e-9) / body[_COMPARED_MM])
+        side = math.copysign(1.0, parted) if abs(parted) > 2.0 * numbers[MASS_TOLERANCE] + CONTRADICTION_FLOOR else 0.0
+        body[_MISMATCH] += (1.0 - math.exp(-dt / MISMATCH_TIME)) * (side - body[_MISMATCH])
+
+
+@compiled
+def _contradicted(numbers, body):  # type: ignore[no-untyped-def]
+    """Return whether no mass within its tolerance makes accelerations of forces, while the wheels grip or for long."""
+    return (
+        mass_contradicted(numbers[MASS_TOLERANCE], body[_LEARNED_MM], body[_LEARNED_MA])
+        or abs(body[_MISMATCH]) > MISMATCH_SHARE
+    )
+
+
+@compiled
 def _estimate(numbers, body, wheels, sensed, jacobian):  # type: ignore[no-untyped-def]
     """Return what `SlipEstimate` holds: numbers (4, n, 2), the bound, and flags (3, n, 2)."""
     n = len(wheels)
     result, valid = np.empty((4, n, 2)), np.empty((3, n, 2), dtype=np.bool_)
     settled = body[_TIME] > SETTLED_TIME_CONSTANTS / numbers[BANDWIDTH]
-    contradicted = mass_contradicted(numbers[MASS_TOLERANCE], body[_LEARNED_MM], body[_LEARNED_MA])
+    contradicted = _contradicted(numbers, body)
     bound = body[_BOUND] + body[_LATE]
     for i in range(n):
         for row in range(2):
@@ -378,8 +411,7 @@ class RobotSlidingModeObserver:
 
     def contradicted(self, state: RobotObserverState) -> bool:
         """Whether forces and accelerations contradict each other: the description does not match, or all wheels spin."""
-        body = state.body
-        return bool(mass_contradicted(self._numbers[MASS_TOLERANCE], body[_LEARNED_MM], body[_LEARNED_MA]))
+        return bool(_contradicted(self._numbers, state.body))
 
     def trust(self, state: RobotObserverState) -> FloatArray:
         """Return how far each wheel was trusted to grip at the last reading (n,), in [0, 1]."""

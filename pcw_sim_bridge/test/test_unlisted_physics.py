@@ -23,17 +23,20 @@ from pcw_description.effects.kinds import (
     FORCE_INPUTS,
     POSE_X,
     POSE_YAW,
+    TWIST_X,
+    TWIST_Y,
     ChassisForceEffect,
     JointTorqueEffect,
 )
 from pcw_sim_bridge import simulated_run
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
-from pcw_sim_bridge.mismatch.generated_effect import GeneratedEffect, NoSuchKernelError, generate
+from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
 from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier
+from pcw_sim_bridge.mismatch.regression_problem import Sites
 from pcw_sim_bridge.mismatch.report import write_report
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.rollout import HORIZONS
-from pcw_sim_bridge.mismatch.unknown_law import Basis, Factor, Law, Place
+from pcw_sim_bridge.mismatch.unknown_law import Basis, Factor, Law, Place, hypotheses
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import Plant, PlantState
 
@@ -250,6 +253,27 @@ def test_a_force_over_the_floor_is_a_file_too(tmp_path):
     wrench = effect.contribution(at, made.parameters)
     np.testing.assert_allclose(wrench[:, 0], np.cos(at[:, POSE_YAW]) * size, atol=1e-4)
     np.testing.assert_allclose(wrench[:, 1], -np.sin(at[:, POSE_YAW]) * size, atol=1e-4)
+
+
+def test_a_product_on_the_chassis_is_tried_and_is_a_file(tmp_path):
+    """A keel's moment, v_x v_y, was among no hypotheses: a robot with one was said to miss nothing."""
+    along = np.linspace(-0.5, 0.5, 60)
+    variables = {name: along for name in ("time", "v_x", "v_y", "omega", "speed", "yaw")}
+    casters = [f"{axis}_{what}/only" for axis in ("drive", "steer") for what in ("angle", "velocity", "torque")]
+    variables |= {name: along for name in (*casters, "drive_normal_force/only")}
+    sites = Sites(("drive_torque/only", "steer_torque/only", *ROWS), variables, 0.05, lambda torques: torques)
+    keel = Place("chassis_torque/z", Factor("value", "v_y"), ((("v_x", 1.0),),))
+    [law] = [law for law in hypotheses(sites) if law.places == (keel,)]
+    law = dataclasses.replace(law, basis=Basis("speed", KNOTS, 0.05))
+    weights = np.random.default_rng(1).standard_normal(9)
+    made = generate(law, weights, ["a_bag"])
+    effect = loaded(made, tmp_path / "effects")
+    at = np.zeros((50, FORCE_INPUTS))
+    at[:, [TWIST_X, TWIST_Y]] = np.random.default_rng(2).uniform(-5.0, 7.0, (50, 2))
+    moment = at[:, TWIST_Y] * (law.basis.functions([at[:, TWIST_X]]) @ weights)
+    wrench = effect.contribution(at, made.parameters)
+    np.testing.assert_allclose(wrench[:, -1], moment, rtol=1e-4, atol=1e-4)
+    assert not wrench[:, :2].any() and "v_x and v_y" in effect.summary
 
 
 def test_a_file_passes_the_checks_of_the_house(tmp_path):

@@ -1,4 +1,7 @@
-"""What the command channels of a robot say: each joint searched on its own, and proved on what it has not seen."""
+"""What the command channels of a robot say: each joint searched on its own, and proved on what it has not seen.
+
+The same effect in every drive, or in every steering, with numbers that agree is one effect of all of them.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,22 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy import stats
 
 from pcw_description.effect_instance import EffectInstance
 
 from .evidence_selection import EffectSearch
-from .explanation import Explanation, NamedTerm, explain
+from .explanation import HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
 from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
 from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
-from .regression_problem import FloatArray, RegressionProblem
+from .regression_problem import Channel, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 
 Progress = Callable[[str], None]
+# Numbers of several joints agree where chance alone would part them further once in so many.
+AGREEING = 0.999
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +89,52 @@ def command_findings(
             (*found.proofs, proof),
             (*found.ladder, *_ladder(explanation)),
         )
-    return found
+    return _shared(found, [problem.channels[0] for problem in problems])
+
+
+def _shared(found: CommandFindings, channels: Sequence[Channel]) -> CommandFindings:
+    """Make one effect of those that all joints of an axis have alike."""
+    named, locations = list(found.named), list(found.locations)
+    for axis in ("drive", "steer"):
+        casters = tuple(caster for channel in channels if channel.axis == axis for caster in channel.casters)
+        for effect in dict.fromkeys(n.term.effect for n, _ in named):
+            own = [k for k, place in enumerate(locations) if place.axis == axis and named[k][0].term.effect == effect]
+            targets = [named[k][0].term.target[0] for k in own]
+            pooled = _pooled([named[k][0] for k in own]) if sorted(targets) == sorted(casters) and len(own) > 1 else None
+            if pooled is None:
+                continue
+            places = [locations[k] for k in own]
+            pooled = dataclasses.replace(pooled, term=dataclasses.replace(pooled.term, target=casters))
+            where = dataclasses.replace(
+                places[0], casters=casters, channels=tuple(name for place in places for name in place.channels)
+            )
+            named = [_with_instance(pooled), *(entry for k, entry in enumerate(named) if k not in own)]
+            locations = [where, *(place for k, place in enumerate(locations) if k not in own)]
+    return dataclasses.replace(found, named=tuple(named), locations=tuple(locations))
+
+
+def _pooled(named: Sequence[NamedTerm]) -> NamedTerm | None:
+    """Return one finding of several, with their numbers weighted by their intervals; None where they do not agree."""
+    estimates = {}
+    for name, first in named[0].estimates.items():
+        values = np.array([n.estimates[name].value for n in named])
+        deviations = np.array([(n.estimates[name].high - n.estimates[name].low) / (2.0 * HALF_WIDTH) for n in named])
+        if not np.all(deviations > 0.0):  # a number that nobody searched for is the same everywhere
+            if np.ptp(values) > 0.0:
+                return None
+            estimates[name] = first
+            continue
+        weights = deviations**-2.0
+        # What makes all of them uncertain, as the time a command is under way, does not average out.
+        value, deviation = float(values @ weights / weights.sum()), float(deviations.min())
+        if np.sum(((values - value) / deviations) ** 2) > stats.chi2.ppf(AGREEING, len(named) - 1):
+            return None
+        estimates[name] = Estimate(value, first.unit, value - HALF_WIDTH * deviation, value + HALF_WIDTH * deviation)
+    return dataclasses.replace(
+        max(named, key=lambda n: n.probability), estimates=estimates,
+        ambiguous_with=tuple(name for name in named[0].ambiguous_with if all(name in n.ambiguous_with for n in named)),
+        loss=sum(n.loss for n in named), held_out=sum(n.held_out for n in named),
+    )  # fmt: skip
 
 
 def _is_idle(problem: RegressionProblem, settings: SelectionSettings | None) -> bool:

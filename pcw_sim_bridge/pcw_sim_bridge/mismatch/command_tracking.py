@@ -64,16 +64,16 @@ class CommandedJoint:
     rate: FloatArray
 
 
-@compiled_for_kernel(ARRAY_SIGNATURE, "float64[::1]", "float64[::1], int64, float64[::1], float64[::1], float64, int64")
-def _torque_along(kernel, values, memory, command, rate, interval, substeps):  # type: ignore[no-untyped-def]
-    """Torque (T,) of an actuator at the end of each interval in which it held a command (T,)."""
+@compiled_for_kernel(ARRAY_SIGNATURE, "float64[::1]", "float64[::1], int64, float64[::1], float64[::1], float64, int64[::1]")
+def _torque_along(kernel, values, memory, command, rate, step, steps):  # type: ignore[no-untyped-def]
+    """Torque (T,) of an actuator at the end of each interval, of so many steps (T,), in which it held a command (T,)."""
     found = command.copy()
     at = np.zeros(ACTUATOR_INPUTS)
     state = np.zeros(memory)
-    at[STEP] = interval / substeps
+    at[STEP] = step
     for t in range(len(command)):
         at[MOTOR_RATE] = rate[t]
-        for _ in range(substeps):
+        for _ in range(steps[t]):
             state[TORQUE] = command[t]
             kernel(at, values, state)
         found[t] = state[TORQUE]
@@ -82,10 +82,12 @@ def _torque_along(kernel, values, memory, command, rate, interval, substeps):  #
 
 def through(effect: ActuatorEffect, values: Mapping[str, float], joint: CommandedJoint, command: FloatArray) -> FloatArray:
     """Return the torque (T,) [N m] that an actuator with the effect makes of a command (T,)."""
-    substeps = max(1, int(np.ceil(joint.interval / LARGEST_STEP - 1e-6)))
-    memory = MEMORY + effect.memory(values, joint.interval / substeps)
+    step = joint.interval / max(1, int(np.ceil(joint.interval / LARGEST_STEP - 1e-6)))
+    # A rate that is no whole part of the controller's: intervals of 3, 3 and 4 ms, over which a command was held so long.
+    intervals = np.diff(joint.time, prepend=joint.time[0] - joint.interval)
+    steps = np.maximum(np.rint(intervals / step), 1).astype(np.int64)
     torque: FloatArray = _torque_along(
-        effect.drive, effect.values(values), memory, command, joint.rate, joint.interval, substeps
+        effect.drive, effect.values(values), MEMORY + effect.memory(values, step), command, joint.rate, step, steps
     )
     return torque
 

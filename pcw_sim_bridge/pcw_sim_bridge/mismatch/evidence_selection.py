@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .effect_gates import EffectGates
+from .gathered_terms import gatherings
 from .noise_model import (
     SLOW_ORDINATES,
     channel_deviations,
@@ -43,6 +44,7 @@ EXACT_ROUNDS = 6
 STEPS = (1.0, 0.5, 0.2)
 GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
 SPLIT_AMONG = 12  # candidates that a term may have taken in
+GATHERED_AMONG = 2  # candidates that several terms may be parts of
 DERIVED_FROM = 2  # after so many rounds that did not settle, columns are taken anew; after twice as many the next time
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
@@ -396,7 +398,13 @@ class EffectSearch:
     def best_exchange(
         self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
     ) -> tuple[str, tuple[Instance, ...]] | None:
-        """The first single exchange or removal that raises the evidence by more than half a nat, if any."""
+        """The first exchange or removal that raises the evidence by more than half a nat, if any."""
+        for others, wider in gatherings(self.problem, instances):
+            for candidate in regression.scan(others, only=wider)[0][:GATHERED_AMONG]:
+                gathered = (*others, self.refine_shape(regression, others, candidate.instance))
+                trial = regression.fit(gathered)
+                if trial.log_evidence > fit.log_evidence + 0.5 and regression.within_bounds(trial):
+                    return f"gather into {self.label(gathered[-1])}", gathered
         for index, instance in enumerate(instances):
             others = instances[:index] + instances[index + 1 :]
             without = regression.fit(others)

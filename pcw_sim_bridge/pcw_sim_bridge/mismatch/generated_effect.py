@@ -163,7 +163,7 @@ def _chassis_force(law: Law, weights: FloatArray, recordings: Sequence[str], tak
     kernel = [
         "@compiled_array_kernel",
         "def wrench(at, parameters, result):  # type: ignore[no-untyped-def]",
-        f'    """Add the force {parts.formula}."""',
+        f'    """Add {parts.formula}."""',
         *(f"    {line}" for line in lines),
     ]
     source = parts.source(
@@ -178,6 +178,8 @@ def _chassis_factor(factor: Factor) -> str:
         return "1.0"
     if factor.kind == "direction":
         return f"{CHASSIS[factor.variable]} / max({CHASSIS['speed']}, {factor.width:.9g})"
+    if factor.kind == "value":
+        return CHASSIS[factor.variable]
     return f"{factor.kind}({CHASSIS[factor.variable]})"
 
 
@@ -302,8 +304,9 @@ class _Parts:
         first = law.places[0]
         quantities = [a[0][0].partition("/")[0] for a in first.arguments]
         kind = {"sign": "friction", "value": "factor", "direction": "drag"}.get(first.factor.kind, "torque")
-        if axis == "chassis" and kind == "torque":
-            kind = "force"
+        if axis == "chassis" and kind in ("torque", "factor"):
+            kind = "moment" if first.site == "chassis_torque/z" else "force"
+            quantities += [first.factor.variable] if first.factor.kind == "value" else []
         name = f"unknown_{axis}_{kind}_by_{'_and_'.join(quantities)}"
         plain, number = name, 1
         while name in taken:
@@ -311,8 +314,11 @@ class _Parts:
             name = f"{plain}_{number}"
         factor = {"sign": "sign(velocity) ", "value": "velocity " if "velocity" in first.factor.variable else "motor_torque "}
         unit = {"one": "N m", "sign": "N m", "value": "1"}.get(first.factor.kind, "N")
+        if axis == "chassis":
+            unit = "N m" if first.site == "chassis_torque/z" else "N"
+            factor["value"] = f"{first.factor.variable} "
         what = f"{kind} in {'the chassis' if axis == 'chassis' else f'the {axis}'} that depends on {' and '.join(quantities)}"
-        return cls(name, what, f"{factor.get(first.factor.kind, '')}({body.formula})", "N" if axis == "chassis" else unit)
+        return cls(name, what, f"{factor.get(first.factor.kind, '')}({body.formula})", unit)
 
     def source(
         self, imports: Sequence[str], body: _Body, kernel: Sequence[str], kind: str, target_kind: str, axis: str, law: str,

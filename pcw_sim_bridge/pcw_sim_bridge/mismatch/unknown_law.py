@@ -316,7 +316,10 @@ def _couplings(casters: Sequence[str]) -> Iterator[tuple[tuple[Place, ...], tupl
 def _forces(
     shared: Sequence[str], variables: Mapping[str, FloatArray]
 ) -> Iterator[tuple[tuple[Place, ...], tuple[str, ...]]]:
-    """Yield forces on the chassis: along an axis of the world or of the robot, along the motion, and a moment."""
+    """Yield forces on the chassis: along an axis of the world or of the robot, along the motion or with it, and a moment.
+
+    A force or moment along an axis of the robot may also be a product of one component of the twist and a function of another.
+    """
     width = DIRECTION_WIDTH * top_of(variables["speed"])
 
     def along(arguments: tuple[Combination, ...]) -> Iterator[tuple[Place, ...]]:
@@ -327,11 +330,15 @@ def _forces(
         yield (Place(x, Factor(), arguments),)
         yield (Place(y, Factor(), arguments),)
         yield Place(x, Factor("direction", "v_x", width), arguments), Place(y, Factor("direction", "v_y", width), arguments)
+        yield Place(x, Factor("value", "v_x"), arguments), Place(y, Factor("value", "v_y"), arguments)
         yield (Place("chassis_torque/z", Factor(), arguments),)
 
     for name in shared:
         for places in along((((name, 1.0),),)):
             yield places, _kinds(name)
+    for site in ("chassis_force/x", "chassis_force/y", "chassis_torque/z"):
+        for one, other in itertools.permutations(("v_x", "v_y", "omega"), 2):
+            yield (Place(site, Factor("value", one), (((other, 1.0),),)),), _kinds(other)
     if "x" in variables:
         for places in along(((("x", 1.0),), (("y", 1.0),))):
             yield places, ("map",)

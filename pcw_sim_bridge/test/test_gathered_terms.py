@@ -1,0 +1,42 @@
+"""Terms of one effect on single casters are offered together for one on all of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from pcw_sim_bridge.mismatch.gathered_terms import gatherings
+from pcw_sim_bridge.mismatch.regression_problem import LinearParameter, Term
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
+
+ALL = ("a", "b", "c")
+SIZE = LinearParameter("size", "N m", 0.0, 1.0, 1.0)
+
+
+def term(effect, target, axis=None):
+    return Term(effect, target, (SIZE,), ({},), lambda shape: np.zeros((1, 1, 1)), axis=axis)
+
+
+TERMS = [
+    term("actuator_lag", ("a",), "steer"), term("actuator_lag", ("b",), "steer"), term("actuator_lag", ALL, "steer"),
+    term("actuator_delay", ALL, "steer"), term("actuator_delay", ALL, "drive"), term("actuator_delay", ("a",), "steer"),
+    term("payload_mass", ("chassis",)), term("actuator_lag", ("c",), "drive"),
+]  # fmt: skip
+
+
+def offered(*chosen):
+    problem = SimpleNamespace(terms=TERMS)
+    return [
+        ([i.term for i in others], wider) for others, wider in gatherings(problem, [Instance(k, (), (0,)) for k in chosen])
+    ]
+
+
+def test_lags_of_two_steerings_may_be_a_lag_or_a_delay_of_all_steerings():
+    assert offered(0, 6, 1) == [([6], [2, 3])]
+
+
+def test_one_alone_is_not_gathered_nor_are_different_axes():
+    assert offered(0, 6) == offered(0, 7) == []
+
+
+def test_what_is_on_all_already_may_still_be_a_look_alike():
+    assert offered(2, 0) == [([], [3])]
