@@ -35,13 +35,15 @@ setup(
     maintainer="PCW maintainers",
     maintainer_email="pcw-maintainers@example.org",
     description=(
-        "Controllers for powered-caster robots: computed torque with the pseudo-inverse, quintic "
-        "trajectories, torque limits and excitations."
+        "Controllers for powered-caster robots: resolved motion rate, sliding mode, computed torque, slip and "
+        "traction control; trajectories, torque limits and excitations."
     ),
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             "computed_torque = pcw_control.nodes.computed_torque:main",
+            "controller = pcw_control.nodes.controller:main",
+            "gain_check = pcw_control.gain_check:main",
         ],
     },
 )

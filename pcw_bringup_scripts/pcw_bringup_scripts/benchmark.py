@@ -24,12 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pcw_control.computed_torque import (
-    ComputedTorque,
-    ComputedTorqueMeasurement,
-    TwistReference,
-    initial_state,
-)
+from pcw_control.computed_torque import ComputedTorque
+from pcw_control.controller_interface import ControllerMeasurement, TwistReference
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.augmented_object_model import AugmentedObjectModel
 from pcw_description.differential_kinematics import inverse_kinematics
@@ -300,7 +296,7 @@ def with_controller(plant_name: str, seconds: float) -> Prepare:
 
         # The robot drives on from repeat to repeat: a reset lets it settle on its springs, which is no part of a run.
         samples = list(simulated.advance())
-        control, odometry, torque = initial_state(), initial_odometry(), np.zeros((robot.n, 2))
+        control, odometry, torque = controller.initial_state(), initial_odometry(), np.zeros((robot.n, 2))
         dt, saturated = simulated.control_period, False
 
         def work() -> float:
@@ -310,7 +306,7 @@ def with_controller(plant_name: str, seconds: float) -> Prepare:
                 reading = samples[-1].reading
                 assert isinstance(reading, JointReading)  # the joints come last
                 odometry, _ = update(robot, parameters, odometry, reading.position, dt)
-                measurement = ComputedTorqueMeasurement(reading.position, reading.velocity, odometry.pose, saturated)
+                measurement = ControllerMeasurement(reading.position, reading.velocity, odometry.pose, saturated)
                 control, output = controller.step(control, measurement, reference, dt)
                 limited = limit_torque(limits, torque, output.torque, reading.velocity, dt)
                 torque, saturated = limited.torque, limited.saturated

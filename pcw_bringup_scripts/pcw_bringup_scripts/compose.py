@@ -17,6 +17,7 @@ from pcw_description.errors import nearest_name
 NODES = {
     "bridge": ("pcw_sim_bridge.nodes.bridge", "BridgeNode"),
     "computed_torque": ("pcw_control.nodes.computed_torque", "ComputedTorqueNode"),
+    "controller": ("pcw_control.nodes.controller", "ControllerNode"),
     "encoder_slip": ("pcw_estimation.nodes.encoder_slip", "EncoderSlipNode"),
     "imu_slip": ("pcw_estimation.nodes.imu_slip", "ImuSlipNode"),
     "markers": ("pcw_sim_bridge.nodes.markers", "MarkersNode"),

@@ -30,10 +30,9 @@ import numpy as np
 
 from pcw_control import (
     ComputedTorque,
-    ComputedTorqueMeasurement,
+    ControllerMeasurement,
     TorqueLimits,
     TwistReference,
-    computed_torque,
     limit_torque,
 )
 from pcw_control.excitation import SHORTEST
@@ -128,8 +127,9 @@ def compile_inner_loops(nominal: RobotDescription, plant_name: str) -> None:
     detector = SlipConsensus(nominal)
     _, finding = detector.step(detector.initial_state(), at_rest, at_rest, 0.0)
     FaultIsolation(nominal).update(at_rest, at_rest, finding, 0.001)
-    measurement = ComputedTorqueMeasurement(at_rest, at_rest, np.zeros(3))
-    ComputedTorque(nominal).step(computed_torque.initial_state(), measurement, TwistReference(np.zeros(3)), 1.0)
+    measurement = ControllerMeasurement(at_rest, at_rest, np.zeros(3))
+    controller = ComputedTorque(nominal)
+    controller.step(controller.initial_state(), measurement, TwistReference(np.zeros(3)), 1.0)
     limit_torque(TorqueLimits.of_robot(nominal), at_rest, at_rest, at_rest, 1.0)
     AugmentedObjectModel(nominal).evaluate(steer_angle, np.zeros(3))
 

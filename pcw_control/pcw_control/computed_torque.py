@@ -16,6 +16,8 @@ Two kinds of reference:
   base_link and e its integral, which takes up friction and slope. Where the robot is plays no part.
 * a point of a trajectory in odom. e and e_dot are errors of pose and velocity in odom, turned into base_link. V_dot is the
   derivative of components in a turning frame, hence the - omega x V; the error then obeys e_ddot + k_d e_dot + k_p e = 0.
+
+Every other way to share F among the wheels is a subclass with another `_distribute`.
 """
 
 from __future__ import annotations
@@ -26,7 +28,6 @@ import math
 import numpy as np
 
 from pcw_description.augmented_object_model import AugmentedObjectModel
-from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import (
     forward_kinematics_kernel,
     joint_matrix_blocks,
@@ -34,13 +35,24 @@ from pcw_description.differential_kinematics import (
 )
 from pcw_description.robot_description import STEER, FloatArray, RobotDescription
 
+from .controller_interface import (
+    ControllerMeasurement,
+    ControllerOutput,
+    ForceReference,
+    Reference,
+    TwistReference,
+    check_step,
+    internal_force_kernel,
+    parameter,
+)
 from .errors import ControlError
-from .quintic_trajectory import MotionLimits, TrajectoryPoint
+from .quintic_trajectory import TrajectoryPoint
+from .reference_motion import MotionParameters, ReferenceMotion
 
 
 @dataclasses.dataclass(frozen=True)
-class ComputedTorqueParameters:
-    """Gains and limits.
+class ComputedTorqueParameters(MotionParameters):
+    """Gains, besides the limits of the reference.
 
     The gains are those of a unit mass: Lambda scales them to the robot. The defaults place both poles of the pose error at
     10 rad/s, five times below what a loop delay of 2 ms would disturb.
@@ -50,17 +62,12 @@ class ComputedTorqueParameters:
         position_gain: k_p on the pose error [1/s^2].
         integral_gain: k_p on the integral of the velocity error, when a twist is followed [1/s^2].
         integral_limit: largest acceleration that this integral may ask for (x, y [m/s^2], yaw [rad/s^2]).
-        limits: limits of the reference when a twist is followed.
-        joint_speed_fraction: the reference twist is slowed down where a joint would turn faster than this part of its
-            limit. A caster that turns round is the usual cause: it steers at up to v/b.
     """
 
-    velocity_gain: float = 20.0
-    position_gain: float = 100.0
-    integral_gain: float = 50.0
+    velocity_gain: float = parameter(20.0, "1/s", "gain on the velocity error, k_d", maximum=200.0)
+    position_gain: float = parameter(100.0, "1/s^2", "gain on the pose error, k_p", maximum=1e4)
+    integral_gain: float = parameter(50.0, "1/s^2", "gain on the integral of the velocity error", maximum=1e4)
     integral_limit: tuple[float, float, float] = (1.0, 1.0, 3.0)
-    limits: MotionLimits = dataclasses.field(default_factory=lambda: MotionLimits(1.5, 0.5, 3.0, 1.5))
-    joint_speed_fraction: float = 0.8
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -68,16 +75,9 @@ class ComputedTorqueParameters:
         Raises:
             ControlError: names the field, its value and what is allowed.
         """
-        for name in ("velocity_gain", "position_gain", "integral_gain"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ControlError(f"{name} = {value!r} is not allowed; allowed: a finite number, at least 0")
+        super().__post_init__()
         if len(self.integral_limit) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in self.integral_limit):
             raise ControlError(f"integral_limit = {self.integral_limit!r} is not allowed; allowed: three numbers, at least 0")
-        if not 0.0 < self.joint_speed_fraction <= 1.0:
-            raise ControlError(
-                f"joint_speed_fraction = {self.joint_speed_fraction!r} is not allowed; allowed: above 0, at most 1"
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,51 +94,26 @@ class ComputedTorqueState:
 
 
 @dataclasses.dataclass(frozen=True)
-class ComputedTorqueMeasurement:
-    """What the controller measures.
+class Demand:
+    """What the wheels shall do together in this cycle, and the geometry of it.
 
     Attributes:
-        joint_position: (n, 2) [rad].
-        joint_velocity: (n, 2) [rad/s].
-        pose: pose of base_link in odom, from odometry (3,) [m, m, rad]; unused when a twist is followed.
-        saturated: the torque before this one had to be limited, so the integral holds.
-    """
-
-    joint_position: FloatArray
-    joint_velocity: FloatArray
-    pose: FloatArray
-    saturated: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class TwistReference:
-    """A twist of base_link in base_link to follow (3,) [m/s, m/s, rad/s]."""
-
-    twist: FloatArray
-
-
-@dataclasses.dataclass(frozen=True)
-class ComputedTorqueOutput:
-    """What one step gives; the torque still has to pass the torque limits.
-
-    Attributes:
-        torque: joint torques (n, 2) [N m].
-        contact_force: wanted contact forces in the wheel frames (n, 2) [N].
         wrench: operational force F (3,) [N, N, N m] in base_link.
-        twist: odometric twist (3,) in base_link.
-        reference_twist: twist wanted now (3,) in base_link.
+        twist: odometric twist V = A^+ B q_dot (3,).
+        steer_angle: headings (n,) [rad].
+        A: wheel Jacobian (2n, 3).
+        normal_inverse: (A^T A)^-1 (3, 3).
+        inertia: Lambda (3, 3).
+        incompatibility: (I - A A^+) B q_dot (n, 2) [m/s], the part of the slip that encoders see.
     """
 
-    torque: FloatArray
-    contact_force: FloatArray
     wrench: FloatArray
     twist: FloatArray
-    reference_twist: FloatArray
-
-
-def initial_state(twist: FloatArray | None = None) -> ComputedTorqueState:
-    """Return the state of a controller that takes over at a twist (3,), or at rest."""
-    return ComputedTorqueState(np.zeros(3) if twist is None else np.array(twist, dtype=float), np.zeros(3))
+    steer_angle: FloatArray
+    A: FloatArray
+    normal_inverse: FloatArray
+    inertia: FloatArray
+    incompatibility: FloatArray
 
 
 class ComputedTorque:
@@ -154,23 +129,24 @@ class ComputedTorque:
 
     def __init__(self, robot: RobotDescription, parameters: ComputedTorqueParameters | None = None) -> None:
         self.parameters = parameters or ComputedTorqueParameters()
+        self.robot = robot
         self._n = robot.n
         self._model = AugmentedObjectModel(robot)
         self._geometry = (robot.steer_axis, robot.caster_offset)
         self._radius = robot.wheel_radius
         self._B = joint_matrix_blocks(robot)
-        self._B_inverse = np.linalg.inv(self._B)
-        self._speed_limit = robot.speed_limit * self.parameters.joint_speed_fraction
+        self._B_inverse: FloatArray = np.linalg.inv(self._B).astype(np.float64)
+        self._reference_motion = ReferenceMotion(robot, self.parameters)
         gain = self.parameters.integral_gain
         self._largest_integral = np.array(self.parameters.integral_limit) / gain if gain > 0.0 else np.zeros(3)
 
+    def initial_state(self, twist: FloatArray | None = None) -> ComputedTorqueState:
+        """Return the state of a controller that takes over at a twist (3,), or at rest."""
+        return ComputedTorqueState(np.zeros(3) if twist is None else np.array(twist, dtype=float), np.zeros(3))
+
     def step(
-        self,
-        state: ComputedTorqueState,
-        measurement: ComputedTorqueMeasurement,
-        reference: TwistReference | TrajectoryPoint,
-        dt: float,
-    ) -> tuple[ComputedTorqueState, ComputedTorqueOutput]:
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
+    ) -> tuple[ComputedTorqueState, ControllerOutput]:
         """Compute the torques of one cycle.
 
         Args:
@@ -185,44 +161,56 @@ class ComputedTorque:
         Raises:
             ControlError: dt is not positive, or a measurement or the reference is not finite; the state stays as it was.
         """
-        self._check(measurement, reference, dt)
+        check_step(measurement, reference, dt, self._n)
+        state, demand = self._demand(state, measurement, reference, dt)
+        state, F_con = self._distribute(state, demand, measurement, dt)
+        return state, self._output(state, demand, F_con)
+
+    def _demand(
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
+    ) -> tuple[ComputedTorqueState, Demand]:
+        """Return the operational force F that the reference asks for."""
         steer_angle = np.ascontiguousarray(measurement.joint_position[:, STEER])
         A = wheel_jacobian_kernel(*self._geometry, steer_angle)
-        V, _, normal_inverse = forward_kinematics_kernel(
+        V, incompatibility, normal_inverse = forward_kinematics_kernel(
             *self._geometry, self._radius, steer_angle, np.ascontiguousarray(measurement.joint_velocity)
         )
+        if isinstance(reference, ForceReference):
+            raise ControlError(
+                f"a ForceReference is not allowed for {type(self).__name__}; allowed: TwistReference, TrajectoryPoint"
+            )
         if isinstance(reference, TwistReference):
             state, V_dot = self._towards_twist(state, reference.twist, V, A, measurement.saturated, dt)
         else:
-            state, V_dot = self._towards_point(reference, measurement.pose, V)
+            state, V_dot = self._towards_point(state, reference, measurement.pose, V)
         inertia, bias = self._model.evaluate(steer_angle, V)
-        F = inertia @ V_dot + bias
-        F_con = (A @ (normal_inverse @ F)).reshape(self._n, 2)
+        return state, Demand(inertia @ V_dot + bias, V, steer_angle, A, normal_inverse, inertia, incompatibility)
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        """Return contact forces (n, 2) in the wheel frames that make the wrench: (5.6), without internal force."""
+        return state, (demand.A @ (demand.normal_inverse @ demand.wrench)).reshape(self._n, 2)
+
+    def _output(self, state: ComputedTorqueState, demand: Demand, F_con: FloatArray) -> ControllerOutput:
         tau = np.einsum("nji,nj->ni", self._B, F_con)
-        return state, ComputedTorqueOutput(tau, F_con, F, V, state.reference_twist)
+        internal = internal_force_kernel(*self._geometry, demand.steer_angle, F_con)
+        return ControllerOutput(tau, F_con, demand.wrench, demand.twist, state.reference_twist, internal)
 
     def _towards_twist(
         self, state: ComputedTorqueState, target: FloatArray, V: FloatArray, A: FloatArray, saturated: bool, dt: float
     ) -> tuple[ComputedTorqueState, FloatArray]:
         p = self.parameters
-        limits = p.limits
-        wanted = target * _shrink(target, limits.speed, limits.yaw_rate)
-        wanted = wanted * self._joint_speed_factor(A, wanted)
-        change = wanted - state.reference_twist
-        change = change * _shrink(change, limits.acceleration * dt, limits.yaw_acceleration * dt)
-        V_d = state.reference_twist + change
-        # A caster may turn round in less time than the deceleration allows; then the limit of the joint comes first.
-        V_d = V_d * self._joint_speed_factor(A, V_d, slack=1.0 / p.joint_speed_fraction)
-        change = V_d - state.reference_twist
-        V_dot_d = change / dt * _shrink(change, limits.acceleration * dt, limits.yaw_acceleration * dt)
+        V_d, V_dot_d = self._reference_motion.towards(state.reference_twist, target, A, dt)
         e_dot = V_d - V
         e = state.error_integral
         if not saturated and p.integral_gain > 0.0:
             e = np.minimum(np.maximum(e + e_dot * dt, -self._largest_integral), self._largest_integral)
-        return ComputedTorqueState(V_d, e), V_dot_d + p.integral_gain * e + p.velocity_gain * e_dot
+        state = dataclasses.replace(state, reference_twist=V_d, error_integral=e)
+        return state, V_dot_d + p.integral_gain * e + p.velocity_gain * e_dot
 
     def _towards_point(
-        self, point: TrajectoryPoint, pose: FloatArray, V: FloatArray
+        self, state: ComputedTorqueState, point: TrajectoryPoint, pose: FloatArray, V: FloatArray
     ) -> tuple[ComputedTorqueState, FloatArray]:
         p = self.parameters
         R_T = _rotation(-pose[2])
@@ -232,49 +220,7 @@ class ComputedTorque:
         omega_cross_V = np.array([-V[2] * V[1], V[2] * V[0], 0.0])
         V_dot = R_T @ (point.acceleration + p.position_gain * e) + p.velocity_gain * (V_d - V) - omega_cross_V
         # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
-        return ComputedTorqueState(V_d, np.zeros(3)), V_dot
-
-    def _joint_speed_factor(self, A: FloatArray, twist: FloatArray, slack: float = 1.0) -> float:
-        """Return the factor up to 1 that keeps B^-1 A V within the joints' speed limits."""
-        ratio = _largest_joint_speed(A, twist, self._B_inverse, self._speed_limit)
-        return 1.0 / max(1.0, ratio / slack)
-
-    def _check(
-        self, measurement: ComputedTorqueMeasurement, reference: TwistReference | TrajectoryPoint, dt: float
-    ) -> None:
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ControlError(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
-        for name, values in (("joint_position", measurement.joint_position), ("joint_velocity", measurement.joint_velocity)):
-            if values.shape != (self._n, 2) or not np.isfinite(values).all():
-                raise ControlError(f"{name} = {values.tolist()} is not allowed; allowed: finite numbers, shape ({self._n}, 2)")
-        if isinstance(reference, TwistReference):
-            needed = {"reference twist": reference.twist}
-        else:
-            needed = {
-                "pose": measurement.pose, "reference pose": reference.pose, "reference velocity": reference.velocity,
-                "reference acceleration": reference.acceleration,
-            }
-        for name, values in needed.items():
-            if values.shape != (3,) or not np.isfinite(values).all():
-                raise ControlError(f"{name} = {values!r} is not allowed; allowed: three finite numbers")
-
-
-@compiled
-def _largest_joint_speed(A, twist, B_inverse, speed_limit):  # type: ignore[no-untyped-def]
-    """Return the largest of the joint speeds B^-1 A V relative to their limits (n, 2)."""
-    largest = 0.0
-    for i in range(len(B_inverse)):
-        along = A[2 * i, 0] * twist[0] + A[2 * i, 1] * twist[1] + A[2 * i, 2] * twist[2]
-        across = A[2 * i + 1, 0] * twist[0] + A[2 * i + 1, 1] * twist[1] + A[2 * i + 1, 2] * twist[2]
-        for j in range(2):
-            speed = abs(B_inverse[i, j, 0] * along + B_inverse[i, j, 1] * across)
-            largest = max(largest, speed / speed_limit[i, j])
-    return largest
-
-
-def _shrink(twist: FloatArray, linear: float, angular: float) -> float:
-    """Return the factor up to 1 that brings the translation within `linear` and the turn within `angular`."""
-    return 1.0 / max(1.0, math.hypot(twist[0], twist[1]) / linear, abs(twist[2]) / angular)
+        return dataclasses.replace(state, reference_twist=V_d, error_integral=np.zeros(3)), V_dot
 
 
 def _rotation(angle: float) -> FloatArray:

@@ -1,7 +1,6 @@
 """What every torque controller must keep; each controller's test runs it with its own `step`.
 
-A controller here is a class made from a robot, with `step(state, measurement, reference, dt) -> (state, output)`, a module
-function `initial_state(twist)` and outputs `torque` (n, 2), `wrench` (3,), `contact_force` (n, 2).
+A controller is what `pcw_control.controller_interface` says.
 """
 
 import copy
@@ -9,7 +8,7 @@ import copy
 import numpy as np
 import pytest
 
-from pcw_control import ComputedTorqueMeasurement, ControlError, TrajectoryPoint, TwistReference
+from pcw_control import ControlError, ControllerMeasurement, TrajectoryPoint, TwistReference
 from pcw_description import inverse_kinematics
 
 
@@ -18,13 +17,13 @@ def rolling_measurement(robot, twist, steer_angle, pose=None, saturated=False):
     position = np.zeros((robot.n, 2))
     position[:, 1] = steer_angle
     velocity = inverse_kinematics(robot, steer_angle, np.asarray(twist, dtype=float))
-    return ComputedTorqueMeasurement(position, velocity, np.zeros(3) if pose is None else pose, saturated)
+    return ControllerMeasurement(position, velocity, np.zeros(3) if pose is None else pose, saturated)
 
 
-def check_contract(controller, initial_state, robot, rng):
+def check_contract(controller, robot, rng):
     """Run all checks of the contract."""
     measurement = rolling_measurement(robot, rng.normal(0.0, 0.3, 3), rng.uniform(-3.0, 3.0, robot.n))
-    state = initial_state()
+    state = controller.initial_state()
     reference = TwistReference(np.array([0.4, -0.2, 0.3]))
 
     kept = copy.deepcopy((state, measurement, reference))

@@ -9,12 +9,10 @@ import pytest
 
 from pcw_control.computed_torque import (
     ComputedTorque,
-    ComputedTorqueMeasurement,
     ComputedTorqueParameters,
     ComputedTorqueState,
-    TwistReference,
-    initial_state,
 )
+from pcw_control.controller_interface import ControllerMeasurement, TwistReference
 from pcw_control.errors import ControlError
 from pcw_control.quintic_trajectory import MotionLimits, TrajectoryPoint, plan_point_to_point
 from pcw_description import (
@@ -53,7 +51,7 @@ def rng():
 @pytest.mark.parametrize("name", ROBOTS)
 def test_keeps_the_controllers_contract(name, rng):
     robot = load_robot(name)
-    contract.check_contract(ComputedTorque(robot), initial_state, robot, rng)
+    contract.check_contract(ComputedTorque(robot), robot, rng)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -64,7 +62,7 @@ def test_power_of_the_joints_is_power_of_the_wrench(name, rng):
     for _ in range(20):
         twist = rng.normal(0.0, 0.3, 3)
         measurement = contract.rolling_measurement(robot, twist, rng.uniform(-3.0, 3.0, robot.n))
-        _, output = controller.step(initial_state(), measurement, TwistReference(rng.normal(0.0, 0.5, 3)), DT)
+        _, output = controller.step(controller.initial_state(), measurement, TwistReference(rng.normal(0.0, 0.5, 3)), DT)
         power = float(np.sum(output.torque * measurement.joint_velocity))
         scale = float(np.sum(np.abs(output.torque * measurement.joint_velocity)))
         assert power == pytest.approx(float(output.wrench @ twist), abs=1e-12 * max(scale, 1.0))
@@ -76,7 +74,8 @@ def test_contact_forces_carry_the_wrench_without_internal_force(name, rng):
     robot = load_robot(name)
     steer_angle = rng.uniform(-3.0, 3.0, robot.n)
     measurement = contract.rolling_measurement(robot, [0.3, -0.1, 0.4], steer_angle)
-    _, output = ComputedTorque(robot).step(initial_state(), measurement, TwistReference(np.array([1.0, 2.0, -1.0])), DT)
+    controller = ComputedTorque(robot)
+    _, output = controller.step(controller.initial_state(), measurement, TwistReference(np.array([1.0, 2.0, -1.0])), DT)
     A = wheel_jacobian(robot, steer_angle)
     np.testing.assert_allclose(A.T @ output.contact_force.ravel(), output.wrench, rtol=1e-10)
     np.testing.assert_allclose(output.torque.ravel(), joint_matrix(robot).T @ output.contact_force.ravel(), atol=1e-10)
@@ -98,7 +97,8 @@ def test_demands_no_force_of_a_coasting_robot_beyond_the_bias(name):
     twist = np.array([0.06, 0.02, 0.04])  # slow enough for every joint, whatever its heading
     steer_angle = np.linspace(-1.0, 2.0, robot.n)
     measurement = contract.rolling_measurement(robot, twist, steer_angle)
-    _, output = ComputedTorque(robot).step(initial_state(twist), measurement, TwistReference(twist), DT)
+    controller = ComputedTorque(robot)
+    _, output = controller.step(controller.initial_state(twist), measurement, TwistReference(twist), DT)
     _, theta = AugmentedObjectModel(robot).evaluate(steer_angle, twist)
     np.testing.assert_allclose(output.wrench, theta, atol=1e-9)
 
@@ -132,14 +132,15 @@ class IdealPlant:
 
     def measure(self, saturated=False):
         velocity = inverse_kinematics(self.robot, np.ascontiguousarray(self.joint_position[:, 1]), self.twist)
-        return ComputedTorqueMeasurement(self.joint_position, velocity, self.pose, saturated)
+        return ControllerMeasurement(self.joint_position, velocity, self.pose, saturated)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_follows_a_quintic_through_the_turning_of_its_casters(name):
     """Sideways and backwards with a turn, from all wheels ahead: the casters have to turn round on the way."""
     robot = load_robot(name)
-    plant, controller, state = IdealPlant(robot), ComputedTorque(robot), initial_state()
+    plant, controller = IdealPlant(robot), ComputedTorque(robot)
+    state = controller.initial_state()
     limits = MotionLimits(0.3, 0.2, 0.5, 0.5)
     trajectory = plan_point_to_point(
         TrajectoryPoint(np.zeros(3)), TrajectoryPoint(np.array([-0.5, 0.8, 0.6])), limits
@@ -159,7 +160,8 @@ def test_follows_a_quintic_through_the_turning_of_its_casters(name):
 def test_pose_error_dies_out_as_the_gains_say():
     """e_ddot + k_d e_dot + k_p e = 0 in odom, also while the robot turns: (1 + w t) exp(-w t) at w = 10 rad/s."""
     robot = load_robot("thesis")
-    plant, controller, state = IdealPlant(robot), ComputedTorque(robot), initial_state()
+    plant, controller = IdealPlant(robot), ComputedTorque(robot)
+    state = controller.initial_state()
     dt = 5e-4
     spin = np.array([0.0, 0.0, 0.8])
     plant.twist = spin.copy()
@@ -182,7 +184,7 @@ def test_the_integral_takes_up_a_constant_load():
     for integral_gain, bound in ((50.0, 1e-3), (0.0, 1.0)):
         plant = IdealPlant(robot, load=(-40.0, 20.0, 3.0))
         controller = ComputedTorque(robot, ComputedTorqueParameters(integral_gain=integral_gain))
-        state = initial_state()
+        state = controller.initial_state()
         for _ in range(1500):
             state, output = controller.step(state, plant.measure(), TwistReference(target), DT)
             plant.step(output.torque, DT)
@@ -194,7 +196,7 @@ def test_the_integral_takes_up_a_constant_load():
 def test_the_integral_holds_while_torque_is_limited_and_stays_within_its_limit():
     robot = load_robot("thesis")
     controller = ComputedTorque(robot)
-    state = initial_state()
+    state = controller.initial_state()
     measurement = contract.rolling_measurement(robot, np.zeros(3), np.zeros(4), saturated=True)
     for _ in range(1000):
         state, _ = controller.step(state, measurement, TwistReference(np.ones(3)), DT)
@@ -209,7 +211,7 @@ def test_the_reference_keeps_its_limits_of_acceleration_and_speed():
     robot = load_robot("thesis")
     limits = MotionLimits(0.5, 0.4, 0.8, 1.0)
     controller = ComputedTorque(robot, ComputedTorqueParameters(limits=limits))
-    state = initial_state()
+    state = controller.initial_state()
     measurement = contract.rolling_measurement(robot, np.zeros(3), np.zeros(4))
     for _ in range(2000):
         before = state.reference_twist
@@ -225,7 +227,7 @@ def test_the_reference_waits_for_casters_that_turn_round():
     robot = load_robot("thesis")
     controller = ComputedTorque(robot)
     across = contract.rolling_measurement(robot, np.zeros(3), np.full(4, math.pi / 2))
-    state = initial_state()
+    state = controller.initial_state()
     for _ in range(2000):
         state, output = controller.step(state, across, TwistReference(np.array([1.2, 0.0, 0.0])), DT)
     assert output.reference_twist[0] == pytest.approx(0.8 * 15.0 * 0.030)

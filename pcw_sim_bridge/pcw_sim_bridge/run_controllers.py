@@ -6,12 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from pcw_control.computed_torque import (
-    ComputedTorque,
-    ComputedTorqueMeasurement,
-    TwistReference,
-    initial_state,
-)
+from pcw_control import controllers
+from pcw_control.controller_interface import ControllerMeasurement, TwistReference
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.differential_kinematics import forward_kinematics, inverse_kinematics
 from pcw_description.errors import nearest_name
@@ -21,7 +17,11 @@ from .plants.plant import PlantError
 from .sensors import JointReading
 from .simulated_robot import JointCommand
 
-CONTROLLER_NAMES = ("computed_torque", "velocity_loops")
+# Nobody pushes the robot of a run, so those that give way to a push are left out.
+CONTROLLER_NAMES = (
+    *(name for name, entry in controllers.CONTROLLERS.items() if "external_wrench" not in entry.parameters.uses),
+    "velocity_loops",
+)
 
 
 class RunController(Protocol):
@@ -40,16 +40,16 @@ def make_controller(name: str, believed: RobotDescription) -> RunController:
     """
     if name not in CONTROLLER_NAMES:
         raise PlantError(f"controller {name!r} is not allowed; {nearest_name(name, CONTROLLER_NAMES)}")
-    return ComputedTorqueRun(believed) if name == "computed_torque" else VelocityLoopsRun(believed)
+    return VelocityLoopsRun(believed) if name == "velocity_loops" else TorqueRun(name, believed)
 
 
-class ComputedTorqueRun:
-    """Computed torque and torque limits, as in the node of pcw_control."""
+class TorqueRun:
+    """A controller of pcw_control by its name, and the torque limits, as in its node."""
 
-    def __init__(self, believed: RobotDescription) -> None:
+    def __init__(self, name: str, believed: RobotDescription) -> None:
         self._robot = believed
-        self._controller, self._limits = ComputedTorque(believed), TorqueLimits.of_robot(believed)
-        self._state = initial_state()
+        self._controller, self._limits = controllers.make_controller(name, believed), TorqueLimits.of_robot(believed)
+        self._state = self._controller.initial_state()
         self._torque, self._saturated = np.zeros((believed.n, 2)), False
 
     def command(self, joints: JointReading, twist: FloatArray | None, dt: float) -> JointCommand:
@@ -57,10 +57,10 @@ class ComputedTorqueRun:
         if twist is None:
             # When the motors are on again the reference begins at the twist that the robot has then.
             rolling = forward_kinematics(self._robot, _steer_angle(joints), joints.velocity)
-            self._state = initial_state(rolling)
+            self._state = self._controller.initial_state(rolling)
             self._torque, self._saturated = np.zeros((self._robot.n, 2)), False
             return JointCommand(effort=self._torque)
-        measurement = ComputedTorqueMeasurement(joints.position, joints.velocity, np.zeros(3), self._saturated)
+        measurement = ControllerMeasurement(joints.position, joints.velocity, np.zeros(3), self._saturated)
         self._state, wanted = self._controller.step(self._state, measurement, TwistReference(twist), dt)
         limited = limit_torque(self._limits, self._torque, wanted.torque, joints.velocity, dt)
         self._torque, self._saturated = limited.torque, limited.saturated

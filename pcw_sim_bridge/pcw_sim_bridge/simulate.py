@@ -58,8 +58,8 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--plant", default="reduced", metavar="NAME", help=f"{', '.join(PLANT_NAMES)} (default: reduced)")
     options.add_argument(
         "--controller", metavar="NAME",
-        help="computed_torque, or velocity_loops: inverse kinematics and the drives' own velocity loops, a simple robot; "
-        "neither knows of the robot's physics: effects (default: computed_torque; with the wheels off the ground "
+        help="a controller of pcw_control, or velocity_loops: inverse kinematics and the drives' own velocity loops, a simple "
+        "robot; none knows of the robot's physics: effects (default: computed_torque; with the wheels off the ground "
         "velocity_loops, as no twist moves a robot on a jack)",
     )
     options.add_argument(

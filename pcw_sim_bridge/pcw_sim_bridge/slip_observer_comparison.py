@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement, TwistReference
-from pcw_control.computed_torque import initial_state as initial_control
+from pcw_control.computed_torque import ComputedTorque
+from pcw_control.controller_interface import ControllerMeasurement, TwistReference
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.differential_kinematics import wheel_jacobian
 from pcw_description.odometry import OdometryParameters, update
@@ -75,7 +75,8 @@ def drive_run(robot: RobotDescription, pushed: Sequence[int], seed: int, duratio
     rng = np.random.default_rng(seed)
     pace, phase = rng.uniform(0.8, 1.2, 3), rng.uniform(0.0, 0.5, 3)
     simulated = SimulatedRobot(make_plant("reduced", robot), seed)
-    controller, control = ComputedTorque(robot), initial_control()
+    controller = ComputedTorque(robot)
+    control = controller.initial_state()
     limits, torque = TorqueLimits.of_robot(robot), np.zeros((robot.n, 2))
     odometry, parameters = initial_odometry(), OdometryParameters()
     saturated, before, run = False, -1, []
@@ -92,7 +93,7 @@ def drive_run(robot: RobotDescription, pushed: Sequence[int], seed: int, duratio
         odometry, _ = update(robot, parameters, odometry, reading.position, dt)
         swing = np.sin(pace * now * np.array([2.0, 1.5, 1.0]) + phase)
         reference = TwistReference(np.array([0.3, 0.0, 0.0]) + np.array([0.3, 0.2, 0.5]) * swing)
-        measured = ComputedTorqueMeasurement(reading.position, reading.velocity, odometry.pose, saturated)
+        measured = ControllerMeasurement(reading.position, reading.velocity, odometry.pose, saturated)
         control, output = controller.step(control, measured, reference, dt)
         limited = limit_torque(limits, torque, output.torque, reading.velocity, dt)
         torque, saturated = limited.torque, limited.saturated

@@ -6,7 +6,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement, initial_state
+from pcw_control.computed_torque import ComputedTorque
+from pcw_control.controller_interface import ControllerMeasurement
 from pcw_control.quintic_trajectory import TrajectoryPoint
 from pcw_description import load_robot
 from pcw_description.odometry import OdometryParameters, update
@@ -56,7 +57,7 @@ def drive(plant_name: str, path: Callable[[float], np.ndarray], rate: float) -> 
     tangent = path(1e-3) - start
     plant.reset(pose=start, steer_angle=np.full(robot.n, np.arctan2(tangent[1], tangent[0])))
     controller = ComputedTorque(robot)
-    control, odometry = initial_state(), initial_odometry(start)
+    control, odometry = controller.initial_state(), initial_odometry(start)
     parameters = OdometryParameters()
     dt = STEPS_PER_CYCLE * plant.dt
     poses, slips = [], []
@@ -64,7 +65,7 @@ def drive(plant_name: str, path: Callable[[float], np.ndarray], rate: float) -> 
         for cycle in range(round(DURATION / dt)):
             state = plant.state()
             odometry, _ = update(robot, parameters, odometry, state.joint_position, dt)
-            measurement = ComputedTorqueMeasurement(state.joint_position, state.joint_velocity, odometry.pose)
+            measurement = ControllerMeasurement(state.joint_position, state.joint_velocity, odometry.pose)
             control, output = controller.step(control, measurement, reference(path, rate, cycle * dt), dt)
             plant.step(output.torque, STEPS_PER_CYCLE)
             poses.append(state.pose)

@@ -143,7 +143,7 @@ REFUSED = [
     (["--excite", "circle", "--robot", "thesos"], "did you mean 'thesis'?"),
     (["--excite", "circle", "--robot", "mpo700"], "torque control needs at least"),
     (["--excite", "circle", "--plant", "bullet"], "--plant 'bullet' is not allowed; did you mean 'pybullet'?"),
-    (["--excite", "circle", "--controller", "pid"], "--controller 'pid' is not allowed; allowed: computed_torque"),
+    (["--excite", "circle", "--controller", "compute_torque"], "--controller 'compute_torque' is not allowed; did you mean"),
     (["--excite", "wheels_off_ground", "--controller", "computed_torque"], "allowed: velocity_loops with wheels_off_ground"),
     (["--excite", "circle", "--seed", "-1"], "--seed -1 is not allowed; allowed: 0 and above"),
     (["--excite", "circle", "--loss", "0.9"], "loss = 0.9 is not allowed; allowed: 0 to 0.5"),

@@ -1,6 +1,9 @@
-"""The parameters that torque controllers share: declared once, turned into the cores' dataclasses."""
+"""The parameters of the controller node: those of all controllers, declared once, turned into the cores' dataclasses."""
 
 from __future__ import annotations
+
+import dataclasses
+from typing import Any
 
 from rclpy.node import Node
 
@@ -8,24 +11,52 @@ from pcw_description.nodes.node_tools import declare
 from pcw_description.robot_description import RobotDescription
 
 from ..computed_torque import ComputedTorqueParameters
+from ..controller_interface import ControllerParameters
+from ..controllers import CONTROLLERS
 from ..quintic_trajectory import MotionLimits
 from ..torque_limits import MODES, TorqueLimits
 
-_DEFAULTS = ComputedTorqueParameters()
+_DEFAULT_LIMITS = ComputedTorqueParameters().limits
 _GOAL_LIMITS = MotionLimits()
+
+
+def parameter_names() -> dict[tuple[str, str], str]:
+    """Return the ROS name of every field of every controller: the field's own, unless two controllers mean different things.
+
+    Keys are (controller, field). Fields of one name that differ in default, unit or range are told apart as CONTROLLER.FIELD.
+    """
+    meanings: dict[str, set[str]] = {}
+    fields = [(name, field) for name, entry in CONTROLLERS.items() for field in _settable(entry.parameters)]
+    for _, field in fields:
+        meanings.setdefault(field.name, set()).add(repr((field.default, sorted(field.metadata.items()))))
+    return {
+        (name, field.name): field.name if len(meanings[field.name]) == 1 else f"{name}.{field.name}" for name, field in fields
+    }
+
+
+def _settable(parameters: type[ControllerParameters]) -> list[dataclasses.Field[Any]]:
+    return [field for field in dataclasses.fields(parameters) if "range" in field.metadata or "choices" in field.metadata]
 
 
 def declare_controller_parameters(node: Node) -> None:
     """Declare gains and limits; all can be changed while the controller runs."""
-    declare(node, "velocity_gain", _DEFAULTS.velocity_gain, "gain on the velocity error, k_d", "1/s", (0.0, 200.0))
-    declare(node, "position_gain", _DEFAULTS.position_gain, "gain on the pose error, k_p", "1/s^2", (0.0, 1e4))
-    declare(node, "integral_gain", _DEFAULTS.integral_gain, "gain on the integral of the velocity error", "1/s^2", (0.0, 1e4))
-    declare(
-        node, "joint_speed_fraction", _DEFAULTS.joint_speed_fraction, "the reference uses this part of the speed limits",
-        "1", (0.01, 1.0),
-    )
+    declared = set()
+    names = parameter_names()
+    for controller, entry in CONTROLLERS.items():
+        for field in _settable(entry.parameters):
+            name, meta = names[controller, field.name], field.metadata
+            if name in declared:
+                continue
+            declared.add(name)
+            if "choices" in meta:
+                declare(node, name, field.default, meta.get("description", field.name), choices=meta["choices"])
+                continue
+            above = "must be above the lower end" if meta["above"] else None
+            low = meta["range"][0]
+            check = (lambda value, low=low, above=above: above if value == low else None) if above else None
+            declare(node, name, field.default, meta["description"], meta["unit"], meta["range"], check=check)
     for prefix, limits, what in (
-        ("cmd_vel", _DEFAULTS.limits, "of the reference that follows cmd_vel"),
+        ("cmd_vel", _DEFAULT_LIMITS, "of the reference that follows cmd_vel"),
         ("goal", _GOAL_LIMITS, "of the trajectory to goal_pose"),
     ):
         declare(node, f"{prefix}_speed", limits.speed, f"largest speed {what}", "m/s", (0.01, 10.0))
@@ -37,6 +68,8 @@ def declare_controller_parameters(node: Node) -> None:
         )
     declare(node, "torque_limit_mode", "scale", "scale keeps the direction of the wrench, clip cuts each joint", choices=MODES)
     declare(node, "torque_slew", 0.0, "largest change of a joint torque per time; 0 is no limit", "N m/s", (0.0, 1e6))
+    declare(node, "drive_jerk", 0.0, "largest jerk that a wheel is driven with; 0 is no limit", "m/s^3", (0.0, 1e5))
+    declare(node, "drive_power", 0.0, "largest mechanical power of all joints that drive; 0 is no limit", "W", (0.0, 1e6))
 
 
 def motion_limits(node: Node, prefix: str = "goal") -> MotionLimits:
@@ -45,15 +78,21 @@ def motion_limits(node: Node, prefix: str = "goal") -> MotionLimits:
     return MotionLimits(*(node.get_parameter(f"{prefix}_{name}").value for name in names))
 
 
-def controller_parameters(node: Node) -> ComputedTorqueParameters:
-    """Return gains and limits as the parameters are now."""
-    names = ("velocity_gain", "position_gain", "integral_gain", "joint_speed_fraction")
-    return ComputedTorqueParameters(
-        **{name: node.get_parameter(name).value for name in names}, limits=motion_limits(node, "cmd_vel")
-    )
+def controller_parameters(node: Node, controller: str) -> ControllerParameters:
+    """Return the gains and limits of one controller as the parameters are now."""
+    kind, names = CONTROLLERS[controller].parameters, parameter_names()
+    values: dict[str, Any] = {
+        field.name: node.get_parameter(names[controller, field.name]).value for field in _settable(kind)
+    }
+    if any(field.name == "limits" for field in dataclasses.fields(kind)):
+        values["limits"] = motion_limits(node, "cmd_vel")
+    return kind(**values)
 
 
 def torque_limits(node: Node, robot: RobotDescription) -> TorqueLimits:
-    """Return the robot's torque limits with the mode and slew of the parameters."""
-    slew = node.get_parameter("torque_slew").value
-    return TorqueLimits.of_robot(robot, node.get_parameter("torque_limit_mode").value, slew if slew > 0.0 else None)
+    """Return the robot's torque limits with the mode, slew, jerk and power of the parameters."""
+    numbers = {name: node.get_parameter(parameter).value for name, parameter in (
+        ("slew", "torque_slew"), ("power", "drive_power"), ("jerk", "drive_jerk"),
+    )}
+    given = {name: value if value > 0.0 else None for name, value in numbers.items()}
+    return TorqueLimits.of_robot(robot, node.get_parameter("torque_limit_mode").value, **given)

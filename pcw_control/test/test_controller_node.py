@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import PoseStamped, TwistStamped  # noqa: E402
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
@@ -22,7 +22,7 @@ from pcw_description import inverse_kinematics, load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
 from pcw_description.nodes.node_tools import ns_to_stamp, stamp_to_ns  # noqa: E402
 
-CONTROLLER = "pcw_control.nodes.computed_torque"
+CONTROLLER = "pcw_control.nodes.controller"
 THESIS = load_robot("thesis")
 NAMES = list(THESIS.joint_names)
 PERIOD_NS = 2_000_000
@@ -205,14 +205,14 @@ def test_goes_to_a_goal(ros):
 
 def change_state(ros, transition):
     return ros.call(
-        ChangeState, "computed_torque/change_state", ChangeState.Request(transition=Transition(id=transition))
+        ChangeState, "controller/change_state", ChangeState.Request(transition=Transition(id=transition))
     ).success
 
 
 def test_lifecycle_lets_go_on_deactivation_and_can_be_cleaned_up(ros):
     ros.start(CONTROLLER, "-p", "autostart:=false")
     robot = Robot(ros)
-    state = ros.call(GetState, "computed_torque/get_state").current_state.label
+    state = ros.call(GetState, "controller/get_state").current_state.label
     assert state == "unconfigured"
     assert change_state(ros, Transition.TRANSITION_CONFIGURE)
     ros.wait_for(lambda: robot.states.get_subscription_count() > 0)
@@ -260,16 +260,23 @@ def test_gaps_repeats_and_jumps_of_the_stamps_are_counted_and_let_go(ros):
     ros.wait_for(lambda: counts().get("repeated_stamps") == "1")
 
 
+def set_parameter(ros, name, value):
+    if isinstance(value, str):
+        number = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
+    else:
+        number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    request = SetParameters.Request(parameters=[Parameter(name=name, value=number)])
+    [result] = ros.call(SetParameters, "controller/set_parameters", request).results
+    return result
+
+
 def test_refused_parameter_keeps_the_old_value(ros):
     ros.start(CONTROLLER)
 
     def set_gain(value):
-        number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-        parameter = Parameter(name="velocity_gain", value=number)
-        request = SetParameters.Request(parameters=[parameter])
-        [result] = ros.call(SetParameters, "computed_torque/set_parameters", request).results
+        result = set_parameter(ros, "velocity_gain", value)
         request = GetParameters.Request(names=["velocity_gain"])
-        [found] = ros.call(GetParameters, "computed_torque/get_parameters", request).values
+        [found] = ros.call(GetParameters, "controller/get_parameters", request).values
         return result.successful, found.double_value
 
     assert set_gain(-1.0) == (False, 20.0)
@@ -292,3 +299,145 @@ def test_bad_input_ends_it_with_one_line(parameter, complaint):
     assert result.returncode == 2
     assert complaint in result.stderr and "Traceback" not in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_the_controller_changes_while_driving_without_a_jump_of_torque(ros):
+    """From computed torque to each of two others and back; the torque before is known, the ones after come close by."""
+    ros.start(CONTROLLER)
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    robot.run(lambda: robot.drives() and abs(robot.twist[0] - 0.3) < 0.01)
+    for name in ("sliding_mode_rate", "friction_optimal", "computed_torque"):
+        before, start = robot.torque, len(robot.commands)
+        assert set_parameter(ros, "controller", name).successful
+        until = robot.time_ns + 200_000_000
+        robot.run(lambda until=until: robot.time_ns >= until)
+        after = np.array([command.effort for command in robot.commands[start:]]).reshape(-1, 4, 2)
+        change = np.abs(np.diff(np.concatenate([before[None], after]), axis=0)).max()
+        # A twentieth of the torque limit: of what a reference with its limit of acceleration asks for in one cycle.
+        assert change < 0.05 * THESIS.torque_limit.min()
+        assert np.abs(after[:, :, 1]).max() < THESIS.torque_limit.min() and not np.all(after[-1] == 0.0)
+        assert abs(robot.twist[0] - 0.3) < 0.05
+
+    def last(key):
+        return [v.value for d in diagnostics for s in d.status for v in s.values if v.key == key][-1:]
+
+    ros.wait_for(lambda: last("switches") == ["3"] and last("controller") == ["computed_torque"])
+    # What needs a measured wrench cannot take over without one, and what drives goes on.
+    result = set_parameter(ros, "controller", "force_guided")
+    assert not result.successful and "ft_sensor/wrench" in result.reason
+    assert not set_parameter(ros, "controller", "computed_tork").successful
+    robot.run(lambda: robot.drives() or abs(robot.twist[0] - 0.3) < 0.02)
+
+
+def test_without_slip_and_terrain_it_says_so_and_goes_on(ros):
+    """Two inputs that a controller can do without: heard, then silent."""
+    ros.start(
+        CONTROLLER, "-p", "controller:=sliding_mode_rate", "-p", "slip_source:=slip/encoder", "-p", "slip_share:=0.5",
+        "-p", "input_timeout:=0.05",
+    )
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    slip = ros.peer.create_publisher(JointState, "slip/encoder", 10)
+    terrain = ros.peer.create_publisher(JointState, "terrain", 10)
+    names = [f"{name}_{axis}" for name in THESIS.caster_names for axis in ("longitudinal", "lateral")]
+
+    def tell(velocity=(0.0,) * 8):
+        slip.publish(JointState(name=names, velocity=list(velocity)))
+        terrain.publish(JointState(name=list(THESIS.caster_names), position=[0.1] * 4, effort=[0.5] * 4))
+
+    ros.wait_for(lambda: slip.get_subscription_count() > 0 and terrain.get_subscription_count() > 0)
+    robot.run(lambda: tell() or robot.drives())
+    robot.run(lambda: "no valid slip" in warnings_of(diagnostics))
+    robot.run(robot.drives)
+    # A slip of which nothing is vouched for is none: NaN does not get in.
+    robot.run(lambda: tell([math.nan] * 8) or robot.drives())
+    assert set_parameter(ros, "controller", "weighted_pseudo_inverse").successful
+    robot.run(lambda: tell() or robot.drives())
+    robot.run(lambda: "no valid terrain" in warnings_of(diagnostics))
+    robot.run(robot.drives)
+    assert all(np.isfinite(command.effort).all() for command in robot.commands)
+
+
+def test_a_pushed_robot_lets_go_when_the_sensor_falls_silent_or_lies(ros):
+    ros.start(CONTROLLER, "-p", "controller:=force_guided")
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    sensor = ros.peer.create_publisher(WrenchStamped, "ft_sensor/wrench", 10)
+
+    def push(force=20.0, frame="base_link"):
+        message = WrenchStamped()
+        message.header.frame_id, message.wrench.force.x = frame, force
+        sensor.publish(message)
+
+    ros.wait_for(lambda: sensor.get_subscription_count() > 0)
+    gives_way = lambda: bool(robot.commands) and robot.torque[:, 0].sum() > 0.05  # noqa: E731
+    robot.run(lambda: push() or gives_way(), cmd_vel=False)
+    robot.run(robot.let_go, cmd_vel=False)  # silent
+    ros.wait_for(lambda: "no ft_sensor/wrench" in warnings_of(diagnostics))
+    robot.run(lambda: push() or bool(robot.torque.any()), cmd_vel=False)
+    robot.run(lambda: push(math.nan) or robot.let_go(), cmd_vel=False)  # lies
+    ros.wait_for(lambda: "refused: ft_sensor/wrench" in warnings_of(diagnostics))
+    robot.run(lambda: push(20.0, "wrist") or robot.let_go(), cmd_vel=False)
+    assert all(np.isfinite(command.effort).all() for command in robot.commands)
+
+
+@pytest.mark.nightly  # the core's test shows the limits; this one that the parameters reach it
+def test_power_and_jerk_are_limited_in_the_node(ros):
+    ros.start(CONTROLLER, "-p", "drive_power:=2.0", "-p", "drive_jerk:=20.0")
+    robot = Robot(ros)
+    robot.run(lambda: robot.drives() or robot.time_ns > 2e9)
+    until = robot.time_ns + 500_000_000
+    robot.run(lambda: robot.time_ns >= until)
+    effort = np.array([command.effort for command in robot.commands]).reshape(-1, 4, 2)
+    # 20 m/s^3 of 26 kg at a lever of 75 mm is 39 N m/s, and 2 ms of it 0.08 N m; a message may be lost, but not ten.
+    rises = np.diff(np.abs(effort[:, :, 0]), axis=0)
+    assert 0.0 < rises.max() < 0.8
+    assert np.abs(effort).max() > 0.0
+
+
+def test_the_first_name_still_starts_it(ros):
+    controller = ros.start("pcw_control.nodes.computed_torque", "-p", "autostart:=false")
+    assert ros.call(GetState, "computed_torque/get_state").current_state.label == "unconfigured"
+    assert controller.interrupt() == 0
+
+
+FAULTY = """
+import dataclasses
+import numpy as np
+from pcw_control.computed_torque import ComputedTorque
+from pcw_control.nodes import controller
+
+step = ComputedTorque.step
+
+def faulty(self, state, measurement, reference, dt):
+    state, output = step(self, state, measurement, reference, dt)
+    yaw_rate = getattr(reference, "twist", np.zeros(3))[2]
+    if yaw_rate == 2.0:
+        raise RuntimeError("a fault on purpose")
+    if yaw_rate == 1.0:
+        output = dataclasses.replace(output, torque=np.full((4, 2), np.nan))
+    return state, output
+
+ComputedTorque.step = faulty
+raise SystemExit(controller.main())
+"""
+
+
+def test_a_torque_that_is_no_number_lets_go_and_an_exception_latches(ros):
+    """A controller with two faults on purpose, chosen by the yaw rate that is wanted."""
+    ros.run([sys.executable, "-c", FAULTY])
+    robot, diagnostics = Robot(ros), ros.listen(DiagnosticArray, "/diagnostics")
+    robot.run(robot.drives)
+    robot.target = (0.3, 0.0, 1.0)
+    robot.run(robot.let_go)
+    ros.wait_for(lambda: "not finite" in warnings_of(diagnostics))
+    robot.target = (0.3, 0.0, 0.0)
+    robot.run(robot.drives)  # it lets go for as long as it lasts
+    robot.target = (0.3, 0.0, 2.0)
+    robot.run(robot.let_go)
+    ros.wait_for(lambda: "latched: RuntimeError: a fault on purpose" in warnings_of(diagnostics))
+    robot.target, count = (0.3, 0.0, 0.0), len(robot.commands)
+    robot.run(lambda: len(robot.commands) > count + 50)
+    assert not any(np.any(command.effort) for command in robot.commands[count:])
+    assert change_state(ros, Transition.TRANSITION_DEACTIVATE)
+    assert change_state(ros, Transition.TRANSITION_ACTIVATE)
+    robot.run(robot.drives)
+    assert all(np.isfinite(command.effort).all() for command in robot.commands)

@@ -1,0 +1,142 @@
+"""Computed torque whose wheels share the wrench as the ground under each allows.
+
+Three ways to do it, each a controller; the pseudo-inverse through A gives every wheel the same whatever it stands on.
+
+* `FrictionOptimal`: the largest use of friction, |F_i| / (mu_i F_zi), is as small as it can be (a quadratic program).
+* `WeightedPseudoInverse`: weights (mu_i F_zi)^2; nearly as good, in a tenth of the time.
+* `TractionLimitAvoidance`: TLA, table 5.3 [Li2009]. The pseudo-inverse as long as no wheel passes `a` times its traction
+  limit, along or across, or its torque limit; from there the internal forces shift the rest to other wheels:
+
+      F_con = (A^T)^+ F + (I - (A^T)^+ A^T) f_o,    |F_con| <= a f_m
+
+  The printed rule clips f_o component by component, which keeps neither the limit nor the wrench. Here f_o is the least one
+  that keeps both. Where the wrench cannot be made within the limits, the limits hold and the wrench falls short.
+
+* `JacobianPseudoInverse`: the least joint torques, through J = B^-1 A (fig. 5.7); it asks nothing of the ground, and is here
+  to be compared with, as is `BasicSolution`: three forces carry everything.
+
+mu comes from the measurement (`friction`), or is that of the robot's ground; F_z is the robot's weight with the load that
+its own acceleration shifts, unless it is measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+
+from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
+
+from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
+from .controller_interface import ControllerMeasurement, parameter
+from .force_distribution import (
+    basic_forces,
+    friction_optimal_forces,
+    jacobian_forces,
+    limited_forces_kernel,
+    solve_kernel,
+    weighted_forces,
+)
+from .wheel_loads import WheelLoads
+
+
+@dataclasses.dataclass(frozen=True)
+class FrictionParameters(ComputedTorqueParameters):
+    """Gains and limits of a controller that looks at the ground."""
+
+    uses: ClassVar[frozenset[str]] = frozenset({"friction"})
+
+
+@dataclasses.dataclass(frozen=True)
+class TractionLimitParameters(FrictionParameters):
+    """Gains and limits of TLA.
+
+    Attributes:
+        traction_share: a, the part of traction and torque limits that may be used [1].
+    """
+
+    traction_share: float = parameter(
+        0.8, "1", "part of traction and torque limits that may be used, a", above=0.0, maximum=1.0
+    )
+
+
+class JacobianPseudoInverse(ComputedTorque):
+    """Computed torque through J: the least sum of squared joint torques (fig. 5.7)."""
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        return state, jacobian_forces(demand.A, demand.wrench, self._B_inverse)
+
+
+class BasicSolution(ComputedTorque):
+    """Computed torque by three forces only; one of the solutions of (5.4) that has internal forces."""
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        return state, basic_forces(demand.A, demand.wrench)
+
+
+class _OnGround(ComputedTorque):
+    """A controller that knows what its wheels hold."""
+
+    def __init__(self, robot: RobotDescription, parameters: ComputedTorqueParameters | None = None) -> None:
+        super().__init__(robot, parameters or FrictionParameters())
+        self._loads = WheelLoads(robot)
+
+    def _traction_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
+        """Return mu F_z (n, 2) [N] at the acceleration that the demand asks for."""
+        acceleration: FloatArray = solve_kernel(demand.inertia, demand.wrench)
+        return self._loads.traction_limit(
+            demand.steer_angle, acceleration, measurement.friction, measurement.normal_force
+        )
+
+
+class WeightedPseudoInverse(_OnGround):
+    """Computed torque with weights (mu F_z)^2."""
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        return state, weighted_forces(demand.A, demand.wrench, self._traction_limit(demand, measurement))
+
+
+class FrictionOptimal(_OnGround):
+    """Computed torque with the least largest use of friction."""
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        limit = self._traction_limit(demand, measurement)
+        return state, friction_optimal_forces(demand.A, demand.wrench, limit).force
+
+
+class TractionLimitAvoidance(_OnGround):
+    """TLA, table 5.3: no wheel beyond `a` times its limits of traction and torque."""
+
+    parameters: TractionLimitParameters
+
+    def __init__(self, robot: RobotDescription, parameters: TractionLimitParameters | None = None) -> None:
+        super().__init__(robot, parameters or TractionLimitParameters())
+        # |r F_x| and |b_y F_x - b_x F_y| within the torque limits, as a box: across gets what the worst along leaves.
+        along = robot.torque_limit[:, DRIVE] / robot.wheel_radius
+        offset = np.abs(robot.caster_offset)
+        along = np.where(
+            offset[:, 1] > 0.0,
+            np.minimum(along, 0.5 * robot.torque_limit[:, STEER] / np.maximum(offset[:, 1], 1e-12)), along,
+        )
+        across = (robot.torque_limit[:, STEER] - offset[:, 1] * along) / offset[:, 0]
+        self._torque_bound = np.stack([along, across], axis=1)
+
+    def force_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
+        """Return a f_m (n, 2) [N]: a box within both the friction ellipse's axes and the torque limits."""
+        limit = np.minimum(self._traction_limit(demand, measurement), self._torque_bound)
+        return self.parameters.traction_share * limit
+
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        force, _ = limited_forces_kernel(demand.A, demand.wrench, self.force_limit(demand, measurement))
+        return state, force

@@ -1,0 +1,111 @@
+"""What delay the velocity loops of a robot bear with given gains: the command `gain_check`.
+
+    ros2 run pcw_control gain_check [ROBOT ...] [--velocity-gain 20] [--delay 0.002] [--write FOLDER]
+
+For every wheel centre k_p is the gain on its speed: velocity_gain times its effective mass in computed torque, 2 w m in
+RMRC; see `delay_margin`. The margin is that of a robot at rest whose tyres have no damping, which is a bound from below.
+Exit code 0 when every robot bears the delay, 1 when one does not, 2 on bad input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pcw_description.errors import PcwError
+from pcw_description.robot_description import RobotDescription
+from pcw_description.robot_file import load_robot, shipped_robots
+
+from .computed_torque import ComputedTorqueParameters
+from .delay_margin import DELAY, delay_margin, derived_bandwidth, effective_mass, own_mass, tyre_resonance
+from .errors import ControlError
+from .reference_motion import derived_steer_acceleration
+from .resolved_motion_rate import BANDWIDTH
+
+
+def report(robot: RobotDescription, velocity_gain: float, delay: float) -> tuple[list[str], bool]:
+    """Return what there is to say of one robot, and whether it bears the delay [s]."""
+    robot.require_torque_control()
+    mass = effective_mass(robot)
+    w = derived_bandwidth(robot, BANDWIDTH)
+    lines = [
+        f"{robot.name}: joint_states at {robot.sensors.encoders.rate:g} Hz; steering turns round at up to "
+        f"{derived_steer_acceleration(robot):.0f} rad/s^2",
+        "  wheel centre             mass    own mass  resonance   margin, computed torque   margin, RMRC",
+    ]
+    margins = {"computed torque": delay_margin(robot, velocity_gain * mass), "RMRC": delay_margin(robot, 2.0 * w * mass)}
+    for i, name in enumerate(robot.caster_names):
+        for j, axis in enumerate(("along", "across")):
+            lines.append(
+                f"  {name + ', ' + axis:22s} {mass[i, j]:6.2f} kg {own_mass(robot)[i, j]:8.2f} kg "
+                f"{tyre_resonance(robot)[i, j]:6.0f} rad/s {1e3 * margins['computed torque'][i, j]:17.2f} ms "
+                f"{1e3 * margins['RMRC'][i, j]:17.2f} ms"
+            )
+    least = min(float(np.min(margin)) for margin in margins.values())
+    advised = 2.0 * derived_bandwidth(robot, velocity_gain / 2.0, delay)
+    bears = bool(np.min(margins["computed torque"]) >= delay)
+    lines.append(
+        f"  least margin {1e3 * least:.2f} ms; velocity_gain {velocity_gain:g} 1/s "
+        + (f"bears {1e3 * delay:g} ms" if bears else f"does not bear {1e3 * delay:g} ms; advised: {advised:.1f} 1/s")
+        + f"; RMRC and SME-RMRC derive {w:.1f} rad/s"
+    )
+    return lines, bears
+
+
+def parameter_file(robot: RobotDescription, delay: float) -> str:
+    """Return the gains of a robot as a ROS parameter file: both poles of computed torque at w, as the delay allows."""
+    w = derived_bandwidth(robot, BANDWIDTH, delay)
+    gains = {"velocity_gain": 2.0 * w, "position_gain": w * w, "integral_gain": 0.5 * w * w, "bandwidth": w}
+    return "\n".join([
+        f"# Gains of {robot.name}, written by `gain_check --delay {delay:g} --write`: both poles at {w:.2f} rad/s.",
+        "/**:",
+        "  ros__parameters:",
+        *(f"    {name}: {value:.2f}" for name, value in gains.items()),
+        "",
+    ])  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the check."""
+    parser = argparse.ArgumentParser(prog="gain_check", description="Say what delay a robot's control loops bear.")
+    default = ComputedTorqueParameters().velocity_gain
+    parser.add_argument("robots", nargs="*", metavar="ROBOT", help="robot files or shipped names (default: all shipped ones)")
+    parser.add_argument(
+        "--velocity-gain", type=float, default=default, help="k_d of computed torque [1/s] (default: %(default)s)"
+    )
+    parser.add_argument("--delay", type=float, default=DELAY, help="to bear, besides the hold [s] (default: %(default)s)")
+    parser.add_argument("--write", type=Path, metavar="FOLDER", help="write the derived gains, a parameter file per robot")
+    options = parser.parse_args(arguments)
+    try:
+        if not 0.0 <= options.delay <= 0.1:
+            raise ControlError(f"--delay {options.delay!r} s is not allowed; allowed: 0 to 0.1 s")
+        ComputedTorqueParameters(velocity_gain=options.velocity_gain)
+        names, all_bear = options.robots or [name for name in shipped_robots() if _torque_controlled(name)], True
+        for name in names:
+            robot = load_robot(name)
+            lines, bears = report(robot, options.velocity_gain, options.delay)
+            all_bear = all_bear and bears
+            print("\n".join(lines))
+            if options.write is not None:
+                options.write.mkdir(parents=True, exist_ok=True)
+                (options.write / f"{robot.name}.yaml").write_text(parameter_file(robot, options.delay), encoding="utf-8")
+    except (PcwError, OSError) as error:
+        print(f"gain_check: {error}", file=sys.stderr)
+        return 2
+    return 0 if all_bear else 1
+
+
+def _torque_controlled(name: str) -> bool:
+    try:
+        load_robot(name).require_torque_control()
+    except PcwError:
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

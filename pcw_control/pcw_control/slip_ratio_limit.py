@@ -1,0 +1,155 @@
+"""Traction and brake control of a whole robot: no wheel beyond a slip ratio, whatever else is wanted; section 5.3.1 [Li2009].
+
+SCFC holds the slip that wheels do not have in common. What they have in common, encoders do not see; an estimate of it
+(`slip`, of an observer or from outside) does. With it, every drive torque is kept between those that
+`slip_ratio_control` would give to reach the slip ratios -lambda_d and +lambda_d:
+
+    (k (-lambda_d - lambda) - f) / g - w_av  <=  tau_rho  <=  (k (lambda_d - lambda) - f) / g - w_av
+
+so that lambda is drawn into the band, and within it approaches its edges no faster than at the rate k. lambda_d is a
+part of the critical slip ratio under the wheel (`critical_slip`, of the ground where nobody says). The force on the
+wheel need not be known: the sliding mode finds it. Where the slip is not known, or the estimator does not vouch for it,
+the torque stays as it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pcw_description.compiled import compiled
+from pcw_description.differential_kinematics import joint_matrix_blocks
+from pcw_description.robot_description import DRIVE, FloatArray, RobotDescription
+
+from .computed_torque import ComputedTorqueState
+from .controller_interface import (
+    ControllerMeasurement,
+    ControllerOutput,
+    ControllerParameters,
+    Reference,
+    internal_force_kernel,
+    parameter,
+)
+from .slip_constraint_force import (
+    SlipConstraintForce,
+    SlipConstraintForceParameters,
+    SlipConstraintForceState,
+)
+from .slip_ratio_control import SlidingWheel, SlipRatioParameters, slip_ratio_dynamics
+
+
+@dataclasses.dataclass(frozen=True)
+class SlipRatioBandParameters(ControllerParameters):
+    """Which slip ratios are allowed.
+
+    Attributes:
+        share: lambda_d as part of the critical slip ratio [1].
+        least: smallest lambda_d, whatever the ground [1].
+        control: gains of the slip ratio's control.
+    """
+
+    share: float = parameter(0.8, "1", "largest slip ratio as part of the critical one", above=0.0, maximum=5.0)
+    least: float = parameter(0.02, "1", "smallest slip ratio that is allowed on any ground", above=0.0, maximum=0.5)
+    control: SlipRatioParameters = dataclasses.field(default_factory=lambda: SlipRatioParameters(least_speed=0.3))
+
+
+@dataclasses.dataclass(frozen=True)
+class SlipRatioLimitParameters(SlipConstraintForceParameters):
+    """Those of SCFC, and the band of slip ratios.
+
+    Attributes:
+        ratio: the band.
+    """
+
+    uses: ClassVar[frozenset[str]] = frozenset({"slip", "friction"})
+
+    ratio: SlipRatioBandParameters = dataclasses.field(default_factory=SlipRatioBandParameters)
+
+
+@dataclasses.dataclass(frozen=True)
+class SlipRatioLimitState(SlipConstraintForceState):
+    """What SCFC remembers, and the sliding mode of every wheel (n, 4)."""
+
+    ratio: FloatArray
+
+
+class SlipRatioLimit(SlipConstraintForce):
+    """SCFC with every wheel's slip ratio kept in its band."""
+
+    parameters: SlipRatioLimitParameters
+
+    def __init__(self, robot: RobotDescription, parameters: SlipRatioLimitParameters | None = None) -> None:
+        p = parameters or SlipRatioLimitParameters()
+        super().__init__(robot, p)
+        self._wheels = np.array([SlidingWheel.of_robot(robot, i).numbers() for i in range(robot.n)])
+        control = p.ratio.control
+        self._ratio_numbers = np.array(
+            [control.gain, control.sliding_gain, control.layer, control.filter_time, control.least_speed]
+        )
+        self._critical = np.array([tyre.lambda_p for tyre in robot.tyres])
+        self._to_torque = joint_matrix_blocks(robot)
+        self._to_force = np.linalg.inv(self._to_torque)
+
+    def initial_state(self, twist: FloatArray | None = None) -> Any:
+        """Return the state of a controller that takes over at a twist (3,), or at rest."""
+        return SlipRatioLimitState(**vars(super().initial_state(twist)), ratio=np.zeros((self._n, 4)))
+
+    def step(
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
+    ) -> tuple[ComputedTorqueState, ControllerOutput]:
+        """Compute the torques of one cycle; see `ComputedTorque.step`."""
+        state, output = super().step(state, measurement, reference, dt)
+        before: Any = state
+        if measurement.slip is None:
+            return dataclasses.replace(before, ratio=np.zeros((self._n, 4))), output
+        known = np.isfinite(measurement.slip[:, 0])
+        if measurement.slip_valid is not None:
+            known = known & measurement.slip_valid[:, 0]
+        critical = self._critical if measurement.critical_slip is None else measurement.critical_slip
+        band = np.maximum(self.parameters.ratio.share * critical, self.parameters.ratio.least)
+        ratio, drive = _kept_in_band(
+            self._wheels, self._ratio_numbers, before.ratio, self._to_torque,
+            np.ascontiguousarray(measurement.joint_velocity), np.ascontiguousarray(measurement.slip), known, band,
+            np.ascontiguousarray(output.torque[:, DRIVE]), dt,
+        )  # fmt: skip
+        state = dataclasses.replace(before, ratio=ratio)
+        if np.array_equal(drive, output.torque[:, DRIVE]):
+            return state, output
+        torque = output.torque.copy()
+        torque[:, DRIVE] = drive
+        # tau = B^T F once more, so that what is said of forces is true.
+        force = np.einsum("nji,nj->ni", self._to_force, torque)
+        steer_angle = np.ascontiguousarray(measurement.joint_position[:, 1])
+        internal = internal_force_kernel(*self._geometry, steer_angle, force)
+        return state, dataclasses.replace(output, torque=torque, contact_force=force, internal_force=internal)
+
+
+@compiled
+def _kept_in_band(wheels, numbers, before, B, joint_velocity, slip, known, band, wanted, dt):  # type: ignore[no-untyped-def]
+    """Return the sliding modes (n, 4) and the drive torques (n,) within their bounds."""
+    gain, sliding, layer, filter_time, least_speed = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    n = len(wheels)
+    after, torque = np.zeros((n, 4)), wanted.copy()
+    for i in range(n):
+        if not known[i]:
+            continue  # and what the sliding mode had found is forgotten
+        inertia, radius, mass, limit = wheels[i, 0], wheels[i, 1], wheels[i, 2], wheels[i, 3]
+        # With a lateral offset the turning fork rolls the wheel centre along as well.
+        sensed = B[i, 0, 0] * joint_velocity[i, 0] + B[i, 0, 1] * joint_velocity[i, 1]
+        ratio, f, g = slip_ratio_dynamics(
+            inertia, radius, mass, sensed / radius, sensed - slip[i, 0], 0.0, least_speed
+        )
+        g = max(g, 0.05 * radius / (inertia * max(abs(sensed), least_speed)))
+        predicted = before[i, 1] + dt * before[i, 3] if before[i, 0] > 0.0 else ratio
+        K = sliding * limit
+        w = K * min(max((ratio - predicted) / (layer * K * g * dt), -1.0), 1.0)
+        average = before[i, 2] + (w - before[i, 2]) * dt / (filter_time + dt)
+        if before[i, 0] > 0.0:
+            high = max((gain * (band[i] - ratio) - f) / g - average, -limit)
+            low = min((gain * (-band[i] - ratio) - f) / g - average, limit)
+            torque[i] = min(max(wanted[i], low), high)
+        held = min(max(torque[i], -limit), limit)
+        after[i, 0], after[i, 1], after[i, 2], after[i, 3] = 1.0, predicted, average, f + g * (held + w)
+    return after, torque
