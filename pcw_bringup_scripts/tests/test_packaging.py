@@ -50,7 +50,7 @@ KEY_OF_MODULE = {
 # Modules that rosdep has no key for: only an extra may bring them.
 WITHOUT_KEY = {"distributed"}
 # Needed without being imported.
-NOT_IMPORTED = {"ros2launch"}
+NOT_IMPORTED = {"ros2launch", "python3-msgpack"}
 
 
 def prefix_of(package: str) -> Path:
