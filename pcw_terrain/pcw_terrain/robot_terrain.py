@@ -57,12 +57,15 @@ class RobotReading:
         slip: slip velocities B q_dot - A V (n, 2) [m/s].
         force: of the ground on the wheels (n, 2) [N].
         steer_angle: (n,) [rad].
+        known: whose slip is known without believing in a friction curve (n,); None: of all. A slip that was computed from
+            its own force by a curve that is believed in says nothing of the ground.
     """
 
     sensed: FloatArray
     slip: FloatArray
     force: FloatArray
     steer_angle: FloatArray
+    known: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,9 +221,12 @@ class RobotTerrain:
         return self._advance(self._with_force, state, reading, dt)
 
     def step_with_twist(
-        self, state: TerrainState, position: FloatArray, velocity: FloatArray, effort: FloatArray, twist: FloatArray, dt: float
+        self, state: TerrainState, position: FloatArray, velocity: FloatArray, effort: FloatArray, twist: FloatArray,
+        dt: float, known: np.ndarray | None = None,
     ) -> tuple[TerrainState, RobotTerrainEstimate]:
-        """Take one reading of joints (n, 2) and motor torques (n, 2), with the twist (3,) of base_link measured otherwise.
+        """Take one reading of joints (n, 2) and motor torques (n, 2), with the twist (3,) of base_link known otherwise.
+
+        `known` (n,) tells of which casters' own curves that twist does not depend; None: of none.
 
         Raises:
             TerrainError: as `step`.
@@ -237,7 +243,7 @@ class RobotTerrain:
         along = effort[:, DRIVE] / self.robot.wheel_radius
         offset = self.robot.caster_offset
         across = (offset[:, 1] * along - effort[:, STEER]) / offset[:, 0]
-        reading = RobotReading(sensed, slip, np.stack([along, across], axis=1), steer_angle)
+        reading = RobotReading(sensed, slip, np.stack([along, across], axis=1), steer_angle, known)
         return self._advance(self._with_torque, state, reading, dt)
 
     def _advance(
@@ -252,7 +258,8 @@ class RobotTerrain:
         values[0, :, 0] = reading.sensed[:, 0]
         values[0, :, 1] = reading.sensed[:, 0] - reading.slip[:, 0]
         values[0, :, 2] = reading.force[:, 0]
-        values[0, :, 3] = loads
+        # A wheel without load says nothing.
+        values[0, :, 3] = loads if reading.known is None else np.where(reading.known, loads, 0.0)
         values[0, :, 4] = reading.slip[:, 1]
         values[0, :, 5] = reading.force[:, 1]
         state = TerrainState(state.numbers.copy(), state.sums.copy(), state.history.copy())

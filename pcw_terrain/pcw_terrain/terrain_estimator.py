@@ -50,6 +50,8 @@ BLOCK_SPREAD = 2.0 / BLOCK_TIME_CONSTANTS**2 + 1.0 / 12.0
 SPECTRUM_POINTS = 32
 # The instrument is so many blocks older, and by the tyre's relaxation more.
 LEAST_LAG, RELAXATION_LAG = 2, 1.0
+# Noise below this part of the slip is none.
+QUIET_NOISE = 0.05
 CORRELATION_SHARE = 0.005
 # Noise is averaged over this time [s], and blocks count from when so much of it has passed.
 NOISE_MEMORY, NOISE_SETTLED = 0.5, 0.1
@@ -412,24 +414,26 @@ def _forget(state, sums):  # type: ignore[no-untyped-def]
 
 @compiled
 def _take(table, numbers, state, sums, history, last, begin):  # type: ignore[no-untyped-def]
-    """Add the block that has its instrument complete with block `last` of the history, not looking at blocks before `begin`."""
-    lag = max(int(history[last, 7]), LEAST_LAG)
-    index = last - lag
-    if index - lag < begin or history[index, 5] < 1.0 or history[index, 8] > 0.0:
-        return
-    for k in range(index - lag, last + 1):
-        if history[k, 5] == 0.0:
-            return
-    now, before, after = history[index], history[index - lag], history[last]
-    now[8] = 1.0
-    averaged, spread = 0.0, 0.0
-    for k in range(index - LEAST_LAG, index + LEAST_LAG + 1):
-        averaged += history[k, 0] / (2 * LEAST_LAG + 1)
-        spread += history[k, 1]
-    # Neighbours are correlated by filter and tyre, which widens their mean by a half.
-    spread = 1.5 * math.sqrt(spread) / (2 * LEAST_LAG + 1)
-    instrument = 0.5 * (before[0] + after[0])
-    _add_block(table, numbers, state, sums, instrument, now[0], now[1], now[2], now[3], now[6], averaged, spread)
+    """Add the blocks whose instrument is complete with block `last` of the history, not looking at blocks before `begin`."""
+    for index in range(begin, last - LEAST_LAG + 1):
+        lag = max(int(history[index, 7]), LEAST_LAG)
+        if history[index, 5] < 1.0 or history[index, 8] > 0.0 or index + lag > last or index - lag < begin:
+            continue
+        whole = True
+        for k in range(index - lag, index + lag + 1):
+            whole = whole and history[k, 5] > 0.0
+        if not whole:
+            continue
+        now = history[index]
+        now[8] = 1.0
+        averaged, spread = 0.0, 0.0
+        for k in range(index - LEAST_LAG, index + LEAST_LAG + 1):
+            averaged += history[k, 0] / (2 * LEAST_LAG + 1)
+            spread += history[k, 1]
+        # Neighbours are correlated by filter and tyre, which widens their mean by a half.
+        spread = 1.5 * math.sqrt(spread) / (2 * LEAST_LAG + 1)
+        instrument = 0.5 * (history[index - lag, 0] + history[index + lag, 0])
+        _add_block(table, numbers, state, sums, instrument, now[0], now[1], now[2], now[3], now[6], averaged, spread)
 
 
 @compiled
@@ -498,19 +502,24 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     larger, smaller = state[_NOISE], state[_NOISE + 1]
     if abs(velocity) > abs(rolling):
         larger, smaller = smaller, larger
-    slip_gain, lag_blocks = gain, LEAST_LAG
+    slip_gain, relaxed_blocks = gain, 0
     if numbers[_RELAXATION] > 0.0:
         slip_gain = full_gain * block_share(pole, speed / numbers[_RELAXATION], state[_BLOCK_TIME])
-        lag_blocks += math.ceil(RELAXATION_LAG * numbers[_RELAXATION] / speed * pole / BLOCK_TIME_CONSTANTS)
+        relaxed_blocks = math.ceil(RELAXATION_LAG * numbers[_RELAXATION] / speed * pole / BLOCK_TIME_CONSTANTS)
     slip_variance = slip_gain * (other * other * larger + smaller) / (speed * speed) * along * along
     slip_variance += 1e-10
     friction = sign * force / load
     per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
     ends = full_gain * BLOCK_ENDS_NOISE * per_time * per_time * state[_NOISE]
     friction_variance = (gain * state[_NOISE + 2] + ends) / (load * load)
-    friction_variance += (0.002 * friction) ** 2 + 1e-10
+    accuracy = max(numbers[_FRICTION_ACCURACY], 0.002) * friction
+    friction_variance += accuracy * accuracy + 1e-10
     now[0], now[1], now[2], now[3], now[4], now[5] = slip, slip_variance, friction, friction_variance, state[_TIME], 1.0
-    now[7] = min(lag_blocks, (_HISTORY - 1) // 2)
+    # Only where there is noise does the instrument have to be free of it; nearer in time it is the better one.
+    noisy = slip_variance > (QUIET_NOISE * slip) ** 2
+    now[7] = min(LEAST_LAG + relaxed_blocks if noisy else LEAST_LAG, (_HISTORY - 1) // 2)
+    # What does not average out spreads the residuals as well.
+    now[1] += numbers[_SLIP_ACCURACY] ** 2
     # The mean of a curve is bent by noise, and the mean friction by slip that moves within the filter's memory, 2 / pole^2.
     now[6] = slip_variance
     if history[_HISTORY - 2, 5] > 0.0:
@@ -533,8 +542,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
         begin = _HISTORY - max(replayed, 1)
         history[:begin, 5] = 0.0
         history[begin:, 8] = 0.0
-        for index in range(begin, _HISTORY):
-            _take(table, numbers, state, sums, history, index, begin)
+        _take(table, numbers, state, sums, history, _HISTORY - 1, begin)
     else:
         _take(table, numbers, state, sums, history, _HISTORY - 1, 0)
     _solve(numbers, state, sums)
