@@ -44,6 +44,8 @@ from .terrain_estimator import (
 
 # Estimates of casters that differ by more than this many standard deviations stand on different grounds.
 DIFFERENT_GROUND = 3.0
+# Part of the critical slip at which a wheel feels what ground it is on.
+FELT_SLIP = 0.6
 # What observers and loads leave over on a robot that is as its file says; see `TerrainParameters`.
 SLIP_ACCURACY, FRICTION_ACCURACY = 0.004, 0.02
 
@@ -101,6 +103,11 @@ class RobotTerrainEstimate:
     robot: FloatArray
     robot_covariance: FloatArray
     uniform: bool
+
+    @property
+    def felt_now(self) -> np.ndarray:
+        """Where a valid estimate is about the ground under the wheel now: it slips enough to feel it, and nothing speaks against."""
+        return self.valid & ~self.suspect & (np.abs(self.slip) >= FELT_SLIP * self.lambda_p)
 
 
 @compiled
