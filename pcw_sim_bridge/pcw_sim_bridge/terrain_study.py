@@ -32,7 +32,7 @@ from pcw_estimation.sliding_mode_observer import SlidingModeParameters
 from pcw_estimation.slip_estimate import JointMeasurement
 from pcw_terrain.active_identification import ActiveIdentification, ActiveMeasurement, ActiveOutput, Phase
 from pcw_terrain.active_record import ActiveRecord
-from pcw_terrain.robot_terrain import RobotTerrain
+from pcw_terrain.robot_terrain import RobotTerrain, RobotTerrainEstimate
 
 from .plants.factory import make_plant
 from .sensors import JointReading
@@ -136,7 +136,7 @@ def active_run(
     observer = RobotSlidingModeObserver(believed, SlidingModeParameters(measured=measured))
     observed = observer.initial_state()
     terrain, active = RobotTerrain(believed), ActiveIdentification(believed)
-    record, testing = ActiveRecord(terrain, active), active.initial_state()
+    record, testing, live = ActiveRecord(terrain, active), active.initial_state(), terrain.initial_state()
     odometry, odometry_parameters = initial_odometry(), OdometryParameters()
     knowledge, output, position_before = _Knowledge(believed), None, None
     saturated, before, requested, ended, predicted = False, -1, False, 0.0, 0.0
@@ -162,9 +162,14 @@ def active_run(
         under_test = output.testing if output is not None else -1
         if under_test >= 0:
             record.add(measurement, reading.effort, dt)
+            assert output is not None
+            live, now_known = terrain.step_with_twist(
+                live, reading.position, velocity, reading.effort, output.twist, dt, np.arange(n) == under_test
+            )
+            measurement = _with_live(measurement, now_known, under_test)
         testing, output = active.step(testing, measurement, dt)
         if under_test >= 0 and output.testing != under_test:
-            odometry = _learn(record, under_test, knowledge, odometry)
+            odometry, live = _learn(record, under_test, knowledge, odometry), terrain.initial_state()
         odometry, _ = update(believed, odometry_parameters, odometry, output.controller_position, dt)
         seen = ComputedTorqueMeasurement(
             output.controller_position, _speeds(output, reading, measured), odometry.pose, saturated
@@ -197,6 +202,17 @@ def _speeds(output: ActiveOutput, reading: JointReading, measured: str) -> Float
     if measured == "speed" or output.testing >= 0:
         return output.controller_velocity
     return reading.velocity
+
+
+def _with_live(measurement: ActiveMeasurement, found: RobotTerrainEstimate, caster: int) -> ActiveMeasurement:
+    """Return the measurement with what is known already of the caster under test, so that its test ends in time."""
+    if not found.valid[caster]:
+        return measurement
+    at = np.arange(len(measurement.known)) == caster
+    return dataclasses.replace(
+        measurement, known=measurement.known | at, mu_p=np.where(at, found.mu_p, measurement.mu_p),
+        lambda_p=np.where(at, found.lambda_p, measurement.lambda_p),
+    )  # fmt: skip
 
 
 def _learn(record: ActiveRecord, caster: int, knowledge: _Knowledge, odometry: OdometryState) -> OdometryState:

@@ -32,6 +32,8 @@ from .errors import TerrainError, require, require_dt
 CREEP_RATE = 100.0
 # At which slip that no creep explains is followed; differences of encoder angles are rough [rad/s].
 STRAY_RATE = 50.0
+# Slip up to which friction is taken as proportional to it [1], and squared friction times speed needed [m^2/s^2].
+CREEP_SLIP, LEAST_CREEP = 0.04, 0.02
 # How much more a turn counts than a way, at the place of the outermost caster.
 TURNING_WEIGHT = 3.0
 # A slip ratio that is commanded is no larger than this [1].
@@ -92,7 +94,7 @@ class ActiveParameters:
     first_slip: float = 0.03
     greatest_slip: float = 0.5
     growth: float = 4.0
-    enough: float = 1.5
+    enough: float = 1.8
     return_time: float = 0.1
     settle_time: float = 0.1
     rest_time: float = 0.05
@@ -166,6 +168,7 @@ class ActiveState:
         rolled_ahead: by how much the joints have turned further than wheels that roll would have (n, 2) [rad].
         creep: slip ratios that the forces take, filtered (n, 2) [1].
         strays: slip velocities that no creep explains, filtered (n,) [m/s].
+        creep_sums: of slip times friction and of friction squared, at the beginning of the test, and the relaxed slip (3,).
         spent: sum of the wrenches so far of the casters under test, for a force of 1 (3,) [1, 1, m].
         backwards: whether the one under test is braked.
         refusal: why it ended early.
@@ -179,6 +182,7 @@ class ActiveState:
     rolled_ahead: FloatArray
     creep: FloatArray
     strays: FloatArray
+    creep_sums: FloatArray
     spent: FloatArray
     backwards: bool
     refusal: Refusal
@@ -250,7 +254,7 @@ class ActiveIdentification:
 
     def initial_state(self) -> ActiveState:
         """Return the state in which nothing goes on."""
-        return ActiveState(Phase.IDLE, (), 0.0, 0.0, 0.0, np.zeros((self.n, 2)), np.zeros((self.n, 2)), np.zeros(self.n), np.zeros(3), False, Refusal.NONE)
+        return ActiveState(Phase.IDLE, (), 0.0, 0.0, 0.0, np.zeros((self.n, 2)), np.zeros((self.n, 2)), np.zeros(self.n), np.zeros(3), np.zeros(3), False, Refusal.NONE)
 
     def request(self, state: ActiveState, casters: tuple[int, ...] | None = None) -> ActiveState:
         """Return the state with the test of some casters, all by default, asked for.
@@ -311,7 +315,7 @@ class ActiveIdentification:
         """
         require_dt(dt)
         self._check(measurement)
-        p, m = self.parameters, measurement
+        p, m = self.parameters, self._with_creep(state, measurement)
         steer_angle = np.ascontiguousarray(m.position[:, STEER])
         A = wheel_jacobian_kernel(self.robot.steer_axis, self.robot.caster_offset, steer_angle)
         sensed = np.einsum("nij,nj->ni", self._B, m.velocity)
@@ -342,7 +346,7 @@ class ActiveIdentification:
         backwards = sizes[1] < sizes[0]
         spent = state.spent + (-wrench if backwards else wrench)
         return dataclasses.replace(
-            state, phase=Phase.SLIP, elapsed=0.0, slip=0.0, integral=0.0, strays=np.zeros(self.n),
+            state, phase=Phase.SLIP, elapsed=0.0, slip=0.0, integral=0.0, strays=np.zeros(self.n), creep_sums=np.zeros(3),
             backwards=backwards, spent=spent,
         )
 
@@ -387,6 +391,8 @@ class ActiveIdentification:
         else:
             slip = state.slip * max(0.0, 1.0 - dt / max(p.return_time - state.elapsed + dt, dt))
             state = dataclasses.replace(state, slip=slip)
+        if state.phase is Phase.SLIP and abs(state.slip) <= CREEP_SLIP:
+            state = self._learn_creep(state, m, A, sensed, testing, velocity, dt)
         # The tyre follows over its relaxation length: to let go in time the wheel goes ahead of what is wanted of the tyre.
         lead = self._relaxation[testing] / max(abs(velocity), p.least_speed) * (state.slip - slip_before) / dt
         lead = lead if state.phase is Phase.RETURN else 0.0
@@ -441,6 +447,34 @@ class ActiveIdentification:
         wrench = A[2 * caster : 2 * caster + 2].T @ force
         rest = A[rows]
         return -(rest @ np.linalg.solve(rest.T @ rest, wrench)).reshape(-1, 2)
+
+    def _learn_creep(
+        self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, sensed: FloatArray, testing: int, velocity: float,
+        dt: float,
+    ) -> ActiveState:  # fmt: skip
+        """Return the state with one more reading of slip over friction, while both are small and proportional.
+
+        The others' creep per friction, c, is that of the wheel under test: eps_i = s_i + c a_i . T, where s_i is its slip
+        against the others as they are measured and T the twist that their friction would feign with c = 1. As eps_i is also
+        c |v| mu_i, c follows from s_i = c (|v| mu_i - a_i . T).
+        """
+        friction = m.force / np.maximum(m.normal_force, 1e-9)[:, None] * np.linalg.norm(sensed, axis=1)[:, None]
+        apart = float(sensed[testing, 0] - A[2 * testing] @ self._twist(A, sensed, testing))
+        feigned = float(friction[testing, 0] - A[2 * testing] @ self._twist(A, friction, testing))
+        # Forces answer over the tyre's relaxation length, and so the slip has to.
+        rate = max(abs(velocity), self.parameters.least_speed) / max(self._relaxation[testing], 1e-6)
+        product, square, relaxed = state.creep_sums
+        relaxed -= math.expm1(-rate * dt) * (apart - relaxed)
+        sums = np.array([product + relaxed * feigned, square + feigned * feigned, relaxed])
+        return dataclasses.replace(state, creep_sums=sums)
+
+    def _with_creep(self, state: ActiveState, m: ActiveMeasurement) -> ActiveMeasurement:
+        """Return the measurement with the ground that is only believed in made to fit the creep that was felt."""
+        product, square, _ = state.creep_sums
+        if state.phase not in (Phase.SLIP, Phase.RETURN) or square <= LEAST_CREEP or product <= 0.0:
+            return m
+        lambda_p = np.where(m.known, m.lambda_p, np.clip(2.0 * m.mu_p * product / square, 0.01, 1.0))
+        return dataclasses.replace(m, lambda_p=lambda_p)
 
     def twist_of_others(
         self, state: ActiveState, measurement: ActiveMeasurement, testing: int, dt: float
