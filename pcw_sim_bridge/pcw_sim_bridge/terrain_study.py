@@ -278,13 +278,16 @@ def document(plants: Sequence[str], seeds: int) -> str:
         "",
         f"Written by `python -m pcw_sim_bridge.terrain_study --seeds {seeds}`; nothing here is typed in.",
         "",
-        f"The `{ROBOT}` robot follows a straight line at {SPEED:g} m/s and is asked to identify the ground under every caster by "
+        f"The `{ROBOT}` robot follows a straight line at {SPEED:g} m/s and is asked to identify the ground "
+        "under every caster by "
         "letting one after the other slip. mu_p is drawn from 0.3 to 0.8 and lambda_p from 0.06 to 0.18; everything that "
         "computes believes in 0.8 and 0.1 at first. `angle`: joint angles and motor torques are all that observer and "
-        "identification are given. The path's error is that of base_link against its line, along and across together, from the "
+        "identification are given. The path's error is that of base_link against its line, along and across "
+        "together, from the "
         "request until after the last test.",
         "",
-        "| plant | measured | tests | valid | mu_p: median error | worst | lambda_p: median | worst | 95 % intervals hold mu_p, "
+        "| plant | measured | tests | valid | mu_p: median error | worst | lambda_p: median | worst | 95 % "
+        "intervals hold mu_p, "
         "lambda_p | slowest, all casters | path: median | worst | yaw, worst | path predicted, one test | ended early |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
@@ -293,19 +296,23 @@ def document(plants: Sequence[str], seeds: int) -> str:
             grounds = [random_ground(seed) for seed in range(seeds)]
             started = time.perf_counter()
             runs = [
-                active_run(on_ground(believed, *ground), believed, plant, seed, measured) for seed, ground in enumerate(grounds)
+                active_run(on_ground(believed, *ground), believed, plant, seed, measured)
+                for seed, ground in enumerate(grounds)
             ]
             s = summarise(grounds, runs)
             parts.append(
-                f"| {plant} | {measured} | {s.tests} | {s.valid} | {s.mu_median:.1%} | {s.mu_worst:.1%} | {s.lambda_median:.1%} | "
-                f"{s.lambda_worst:.1%} | {s.covered[0]:.0%}, {s.covered[1]:.0%} | {s.slowest:.2f} s | {1e3 * s.path_median:.1f} mm | "
+                f"| {plant} | {measured} | {s.tests} | {s.valid} | {s.mu_median:.1%} | {s.mu_worst:.1%} | "
+                f"{s.lambda_median:.1%} | "
+                f"{s.lambda_worst:.1%} | {s.covered[0]:.0%}, {s.covered[1]:.0%} | {s.slowest:.2f} s | "
+                f"{1e3 * s.path_median:.1f} mm | "
                 f"{1e3 * s.path_worst:.1f} mm | {1e3 * s.yaw_worst:.1f} mrad | {1e3 * s.predicted:.1f} mm | "
                 f"{'; '.join(sorted(set(s.refusals))) or '-'} |"
             )
             print(parts[-1], f"({time.perf_counter() - started:.0f} s)", flush=True)
     parts += [
         "",
-        "A test needs a motor that can take its wheel past the ground's hold: the drives of `tidybot2` and `dyros_pcv` cannot on "
+        "A test needs a motor that can take its wheel past the ground's hold: the drives of `tidybot2` and "
+        "`dyros_pcv` cannot on "
         "good ground, and are refused there with that reason.",
         "",
     ]

@@ -8,8 +8,8 @@ than the controller asked of it, F_i,ct, and the others take the rest with the l
 
 The increment d_tau is added to the controller's torque. The controller must not take the slipping wheel for motion: instead of
 the joints that are measured it is given those of wheels that roll (`controller_position`, `controller_velocity`). The others
-creep under the forces they take, by the lower root of mu(lambda), as far as that is known; it is taken off too, and casters are
-driven and braked by turns, so that what is left of it cancels out.
+creep under the forces they take, by the lower root of mu(lambda); where the ground is not known, as much as the first slip of
+the test tells. It is taken off too, and casters are driven or braked so that what is left of it cancels out.
 
 Slip grows exponentially, so that a peak is passed equally slowly wherever it lies. It ends where the ground is known, or at
 `greatest_slip`. It does not begin, and ends at once, where it is not safe; see `Refusal` for the reasons.
@@ -85,7 +85,7 @@ class ActiveParameters:
         assumed_friction: peak that a prediction reckons with where none is given [1].
         others_use: part of their friction, as it is believed to be, up to which others may be loaded [1].
         others_slip: slip ratio of another wheel at which it ends [1].
-        torque_reserve: part of a motor's torque that may be used [1].
+        torque_reserve: part of a motor's torque that may be needed by what is believed, which is known to some percent [1].
         longest: of one caster [s].
         force_error: part of a force that is not compensated, for the prediction of the disturbance [1].
         stiffness: k_p of the controller's pose feedback, for the same [1/s^2]; 0: none.
@@ -107,7 +107,7 @@ class ActiveParameters:
     assumed_friction: float = 0.8
     others_use: float = 0.85
     others_slip: float = 0.15
-    torque_reserve: float = 1.0
+    torque_reserve: float = 1.05
     longest: float = 1.5
     force_error: float = 0.15
     stiffness: float = 100.0
@@ -128,8 +128,9 @@ class ActiveParameters:
             require(name, getattr(self, name), minimum=0.0)
         for name in ("greatest_turn_rate", "greatest_steer_rate"):
             require(name, getattr(self, name), above=0.0)
-        for name in ("others_use", "others_slip", "torque_reserve"):
+        for name in ("others_use", "others_slip"):
             require(name, getattr(self, name), above=0.0, maximum=1.0)
+        require("torque_reserve", self.torque_reserve, above=0.0, maximum=1.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +255,20 @@ class ActiveIdentification:
 
     def initial_state(self) -> ActiveState:
         """Return the state in which nothing goes on."""
-        return ActiveState(Phase.IDLE, (), 0.0, 0.0, 0.0, np.zeros((self.n, 2)), np.zeros((self.n, 2)), np.zeros(self.n), np.zeros(3), np.zeros(3), False, Refusal.NONE)
+        return ActiveState(
+            Phase.IDLE,
+            (),
+            0.0,
+            0.0,
+            0.0,
+            np.zeros((self.n, 2)),
+            np.zeros((self.n, 2)),
+            np.zeros(self.n),
+            np.zeros(3),
+            np.zeros(3),
+            False,
+            Refusal.NONE,
+        )
 
     def request(self, state: ActiveState, casters: tuple[int, ...] | None = None) -> ActiveState:
         """Return the state with the test of some casters, all by default, asked for.
@@ -265,7 +279,9 @@ class ActiveIdentification:
         queue = tuple(range(self.n)) if casters is None else tuple(casters)
         if not queue or any(not 0 <= index < self.n for index in queue):
             raise TerrainError(f"casters = {queue!r} is not allowed; allowed: indices 0 to {self.n - 1}, at least one")
-        return dataclasses.replace(state, phase=Phase.WAIT, queue=queue, elapsed=0.0, slip=0.0, spent=np.zeros(3), refusal=Refusal.NONE)
+        return dataclasses.replace(
+            state, phase=Phase.WAIT, queue=queue, elapsed=0.0, slip=0.0, spent=np.zeros(3), refusal=Refusal.NONE
+        )
 
     def cancel(self, state: ActiveState) -> ActiveState:
         """Return the state with everything asked for taken back; a wheel that slips returns first."""
@@ -275,7 +291,9 @@ class ActiveIdentification:
             return self._ended(state, Refusal.CANCELLED)
         return dataclasses.replace(state, queue=state.queue[:1], refusal=Refusal.CANCELLED)
 
-    def predict(self, steer_angle: FloatArray, caster: int, normal_force: FloatArray, mu_p: float | None = None) -> Disturbance:
+    def predict(
+        self, steer_angle: FloatArray, caster: int, normal_force: FloatArray, mu_p: float | None = None
+    ) -> Disturbance:
         """Return what the test of a caster will do to the base.
 
         The force that is not compensated, `force_error` of the peak, works against the controller's stiffness; without one
@@ -346,8 +364,15 @@ class ActiveIdentification:
         backwards = sizes[1] < sizes[0]
         spent = state.spent + (-wrench if backwards else wrench)
         return dataclasses.replace(
-            state, phase=Phase.SLIP, elapsed=0.0, slip=0.0, integral=0.0, strays=np.zeros(self.n), creep_sums=np.zeros(3),
-            backwards=backwards, spent=spent,
+            state,
+            phase=Phase.SLIP,
+            elapsed=0.0,
+            slip=0.0,
+            integral=0.0,
+            strays=np.zeros(self.n),
+            creep_sums=np.zeros(3),
+            backwards=backwards,
+            spent=spent,
         )
 
     def _unsafe(self, caster: int, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> Refusal:
@@ -508,7 +533,7 @@ class ActiveIdentification:
         if testing >= 0:
             rows[2 * testing : 2 * testing + 2] = False
         rest = A[rows]
-        return np.linalg.solve(rest.T @ rest, rest.T @ sensed.ravel()[rows])
+        return np.asarray(np.linalg.solve(rest.T @ rest, rest.T @ sensed.ravel()[rows]), dtype=np.float64)
 
     @staticmethod
     def _seen_position(state: ActiveState, m: ActiveMeasurement) -> FloatArray:

@@ -2,8 +2,9 @@
 
 The others creep under the forces that they take, and the twist that follows from them is off by that creep, which depends on
 the very ground that is looked for. While the test goes on the creep is that of the ground as it is believed to be. Afterwards
-it is that of the ground just found, over and over, until it does not change: all casters whose ground is not known are taken to
-stand on the one under test. Every round takes off two thirds of what is wrong, as the others take about a third of the force.
+it is that of the ground just found, over and over, until it does not change: all casters whose ground is not known are taken
+to stand on the one under test. Every round takes off two thirds of what is wrong, as the others take about a third of the
+force.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class ActiveRecord:
         """Return what was found, and how far the odometry was off meanwhile.
 
         Returns:
-            State and estimate of all casters, of which only that of `caster` has been estimated; and the motion (3,) [m, m, rad]
-            in base_link that an odometry on `ActiveOutput.controller_position` has missed.
+            State and estimate of all casters, of which only that of `caster` has been estimated; and the motion (3,) [m, m,
+            rad] in base_link that an odometry on `ActiveOutput.controller_position` has missed.
 
         Raises:
             TerrainError: nothing has been noted.
@@ -71,10 +72,10 @@ class ActiveRecord:
         follows[caster] = True
         only = np.arange(n) == caster
         used, moved = None, np.zeros(3)
+        estimate: RobotTerrainEstimate
         for _ in range(ROUNDS):
             path = np.zeros(3)
             active, state = self._active.initial_state(), self._terrain.initial_state()
-            estimate = None
             for instant in self._instants:
                 measurement = instant.measurement
                 if used is not None:  # the first round is as it was
@@ -85,9 +86,11 @@ class ActiveRecord:
                 )
                 path += instant.dt * twist
             used = path if used is None else used
-            assert estimate is not None
             moved = path - used
             if not np.isfinite(estimate.mu_p[caster]):
                 break
-            mu_p, lambda_p = np.where(follows, estimate.mu_p[caster], mu_p), np.where(follows, estimate.lambda_p[caster], lambda_p)
+            mu_p, lambda_p = (
+                np.where(follows, estimate.mu_p[caster], mu_p),
+                np.where(follows, estimate.lambda_p[caster], lambda_p),
+            )
         return state, estimate, moved

@@ -1,9 +1,9 @@
 """Which slips say something of the ground, where they come from an observer that believes in a friction curve.
 
-Such an observer takes the slip of a wheel that grips from its force, by the lower root of the curve it believes in. To estimate the
-ground from that slip would give back the belief. The slip of a wheel that has let go is another matter: it follows from the
-motion of the robot, which the other wheels and the forces know. A slip counts as known if the force is so near its believed
-peak, or the slip so far beyond the believed root, that the root was not trusted.
+Such an observer takes the slip of a wheel that grips from its force, by the lower root of the curve it believes in. To
+estimate the ground from that slip would give back the belief. The slip of a wheel that has let go is another matter: it
+follows from the motion of the robot, which the other wheels and the forces know. A slip counts as known if the force is so
+near its believed peak, or the slip so far beyond the believed root, that the root was not trusted.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The ground under every caster of a robot, and under the robot as a whole.
 
-Every caster has an estimator of its own (`terrain_estimator`), with its own tyre. What they are given comes from a slip observer:
-slip velocities and contact forces in the wheel frames; or, where something else measures the robot's motion, from that and the
-motor torques:    eps = B q_dot - A V (3.28),    F_x = tau_rho / r - (I_rho / r^2) d(r rho_dot)/dt (3.45),    F_y by statics.
+Every caster has an estimator of its own (`terrain_estimator`), with its own tyre. What they are given comes from a slip
+observer: slip velocities and contact forces in the wheel frames; or, where something else measures the robot's motion, from
+that and the motor torques:    eps = B q_dot - A V (3.28),    F_x = tau_rho / r - (I_rho / r^2) d(r rho_dot)/dt (3.45),    F_y
+by statics.
 
 Loads follow from the weight and from the contact forces themselves, which accelerate the robot at the height of its centre.
 """
@@ -106,7 +107,7 @@ class RobotTerrainEstimate:
 
     @property
     def felt_now(self) -> np.ndarray:
-        """Where a valid estimate is about the ground under the wheel now: it slips enough to feel it, and nothing speaks against."""
+        """Where a valid estimate is about the ground under the wheel now: it slips enough, and nothing speaks against it."""
         return self.valid & ~self.suspect & (np.abs(self.slip) >= FELT_SLIP * self.lambda_p)
 
 
@@ -146,7 +147,9 @@ def _fuse(results):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _loads(weight, centre_of_mass, height, spring, steer_axis, caster_offset, steer_angle, force, level, normal_force):  # type: ignore[no-untyped-def]
+def _loads(  # type: ignore[no-untyped-def]
+    weight, centre_of_mass, height, spring, steer_axis, caster_offset, steer_angle, force, level, normal_force
+):
     """Fill normal_force (n,): weight, and what forces at the ground tilt about a centre at `height`."""
     n = len(steer_angle)
     centre = np.empty((n, 2))
@@ -158,8 +161,13 @@ def _loads(weight, centre_of_mass, height, spring, steer_axis, caster_offset, st
         push_x += c * force[i, 0] - s * force[i, 1]
         push_y += s * force[i, 0] + c * force[i, 1]
     support_forces(
-        weight, weight * centre_of_mass[0] - height * push_x, weight * centre_of_mass[1] - height * push_y, spring, centre,
-        level, normal_force,
+        weight,
+        weight * centre_of_mass[0] - height * push_x,
+        weight * centre_of_mass[1] - height * push_y,
+        spring,
+        centre,
+        level,
+        normal_force,
     )
 
 
@@ -176,9 +184,7 @@ class RobotTerrain:
         KinematicsError: a caster without offset, of whose side force the steering torque says nothing.
     """
 
-    def __init__(
-        self, robot: RobotDescription, parameters: TerrainParameters | None = None, gravity: float = GRAVITY
-    ) -> None:
+    def __init__(self, robot: RobotDescription, parameters: TerrainParameters | None = None, gravity: float = GRAVITY) -> None:
         robot.require_torque_control()
         self.robot, self.n = robot, robot.n
         base = parameters or TerrainParameters(slip_accuracy=SLIP_ACCURACY, friction_accuracy=FRICTION_ACCURACY)
@@ -228,8 +234,14 @@ class RobotTerrain:
         return self._advance(self._with_force, state, reading, dt)
 
     def step_with_twist(
-        self, state: TerrainState, position: FloatArray, velocity: FloatArray, effort: FloatArray, twist: FloatArray,
-        dt: float, known: np.ndarray | None = None,
+        self,
+        state: TerrainState,
+        position: FloatArray,
+        velocity: FloatArray,
+        effort: FloatArray,
+        twist: FloatArray,
+        dt: float,
+        known: np.ndarray | None = None,
     ) -> tuple[TerrainState, RobotTerrainEstimate]:
         """Take one reading of joints (n, 2) and motor torques (n, 2), with the twist (3,) of base_link known otherwise.
 

@@ -92,7 +92,10 @@ class ClassProbability:
 
 
 def classify(
-    mu_p: float, lambda_p: float, covariance: FloatArray, library: Mapping[str, TerrainClass] = CLASSES,
+    mu_p: float,
+    lambda_p: float,
+    covariance: FloatArray,
+    library: Mapping[str, TerrainClass] = CLASSES,
     prior: Mapping[str, float] | None = None,
 ) -> tuple[ClassProbability, ...]:
     """Return all classes and `NONE`, the most probable first; the probabilities add up to 1.
@@ -112,7 +115,9 @@ def classify(
     covariance = np.asarray(covariance, dtype=float)
     if covariance.shape != (2, 2) or not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] < -1e-12:
         raise TerrainError(f"covariance = {covariance.tolist()} is not allowed; allowed: (2, 2), positive semidefinite")
-    weights = dict(prior) if prior is not None else {NONE: NONE_PRIOR} | dict.fromkeys(library, (1.0 - NONE_PRIOR) / len(library))
+    weights = (
+        dict(prior) if prior is not None else {NONE: NONE_PRIOR} | dict.fromkeys(library, (1.0 - NONE_PRIOR) / len(library))
+    )
     for name in weights:
         if name != NONE and name not in library:
             raise TerrainError(f"prior of {name!r} is not allowed; allowed: {NONE!r}, {', '.join(library)}")

@@ -9,13 +9,15 @@ Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (s
 - the filtered signals are sampled so far apart that their noise is independent, as blocks;
 - the noise of speeds and torques is measured from their second differences, and with it the filtered slip's, s, in lambda_p.
   It bends the curve's mean by g'' s^2 / 2, which is taken off:    g_c = g(x) - g''(x) s^2 / 2;
-- the equations are solved with an instrument, the same slip two blocks before, whose noise is another one:
+  The curve's mean is bent as well by slip that moves within the filter's memory, which is put back;
+- the equations are solved with an instrument, the mean of the slip two blocks before and after, whose noise is another one
+  (further off where the tyre's relaxation carries noise along):
 
-      sum w z (mu_k - mu_p g_c(x_k)) = 0,    sum w a (mu_k - mu_p g_c(x_k)) = 0,    z = g(x_(k-2)),  a = -x_(k-2) g'(x_(k-2)),
+      sum w z (mu_k - mu_p g_c(x_k)) = 0,    sum w a (mu_k - mu_p g_c(x_k)) = 0,    z = g(x_i),  a = -x_i g'(x_i),
 
-  with the effective variance 1/w = s_mu^2 + mu_p^2 (g'^2 s^2 + g''^2 s^4 / 2) at x_(k-2). The sums are kept for a grid of
-  lambda_p, so that nothing is linearised and nothing can diverge: mu_p follows from the first equation, lambda_p is where
-  the second one holds, nearest to the least weighted error.
+  with the effective variance 1/w = s_mu^2 + mu_p^2 s^2 (g'^2 + g''^2 s^2) at the instrument's x_i. The sums are kept for a
+  grid of lambda_p, so that nothing is linearised and nothing can diverge: mu_p follows from the first equation, lambda_p is
+  where the second one holds, nearest to the least weighted error.
 
 The covariance is that of these equations, with the variance and the correlation of the residuals as they are. An estimate is
 valid when it is narrow enough, the slip has been beyond `least_slip` of the largest lambda_p that it allows, and the force
@@ -43,7 +45,8 @@ LEAST_CRITICAL_SLIP, GREATEST_CRITICAL_SLIP = 0.01, 0.8
 GRID = 64
 # A pole of the filter for a cut-off (-3 dB) of two equal ones, and the time between blocks in units of its time constant.
 POLE_PER_CUT_OFF, BLOCK_TIME_CONSTANTS = 2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0), 4.0
-# Of a mean over a block, relative to the filtered signal: the variance of the difference of its ends, and the spread of what moves steadily through filter and block, in units of its way from block to block.
+# Of a mean over a block, relative to the filtered signal: the variance of the difference of its ends, and the spread of what
+# moves steadily through filter and block, in units of its way from block to block.
 _DECAY = math.exp(-BLOCK_TIME_CONSTANTS)
 BLOCK_ENDS_NOISE = 2.0 - 2.0 * (1.0 + BLOCK_TIME_CONSTANTS) * _DECAY
 BLOCK_SPREAD = 2.0 / BLOCK_TIME_CONSTANTS**2 + 1.0 / 12.0
@@ -61,7 +64,9 @@ UNSTEADY_SLIP = 0.25
 # Degrees of freedom that the expected size of the residuals counts for, besides those of the residuals.
 PRIOR_BLOCKS = 5.0
 # Residuals beyond so many standard deviations count as that many; so much of each is allowed for, and so much must add up.
-LARGEST_RESIDUAL, ALLOWED_RESIDUAL, CHANGE_THRESHOLD = 4.0, 1.0, 10.0
+LARGEST_RESIDUAL, ALLOWED_RESIDUAL, CHANGE_THRESHOLD = 4.0, 1.0, 16.0
+# From this sum on nothing more is learned until it is decided; blocks wait in the history, so long.
+SUSPENDED, LONGEST_SUSPENSION = 5.0, 10.0
 # Curves differ from the model by this part of the friction without being another ground.
 CHANGE_FLOOR = 0.05
 YOUNG_BLOCKS = 30.0
@@ -273,8 +278,10 @@ def _grid(j):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_block(table, numbers, state, sums, lag, slip, slip_variance, friction, friction_variance, bending, averaged, spread):  # type: ignore[no-untyped-def]
-    """Add one block to the sums of every lambda_p; `lag` is the instrument's slip, `averaged` that of the last blocks."""
+def _add_block(  # type: ignore[no-untyped-def]
+    table, numbers, state, sums, lag, slip, slip_variance, friction, friction_variance, bending, averaged, spread
+):
+    """Add one block to the sums of every lambda_p; `lag` is the instrument's slip, `averaged` that around it."""
     best = state[_RESULT + 1]
     informative = 1.0
     if best > 0.0:
@@ -543,6 +550,8 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
         history[:begin, 5] = 0.0
         history[begin:, 8] = 0.0
         _take(table, numbers, state, sums, history, _HISTORY - 1, begin)
+    elif max(state[_UP], state[_DOWN]) > SUSPENDED and state[_SUSPECT] <= LONGEST_SUSPENSION:
+        return
     else:
         _take(table, numbers, state, sums, history, _HISTORY - 1, 0)
     _solve(numbers, state, sums)
@@ -616,7 +625,12 @@ def run_wheels(tables, numbers, state, sums, history, readings, dt, every, resul
             if k % every == 0:
                 row = results[k // every, i]
                 row[:8] = state[i, _RESULT : _RESULT + 8]
-                row[8], row[9], row[10], row[11] = state[i, _CHANGES], state[i, _SLIP], state[i, _FRICTION], state[i, _SLIP_NOISE]
+                row[8], row[9], row[10], row[11] = (
+                    state[i, _CHANGES],
+                    state[i, _SLIP],
+                    state[i, _FRICTION],
+                    state[i, _SLIP_NOISE],
+                )
                 row[12], row[13] = state[i, _TIME] - state[i, _CHANGE_TIME], state[i, _SUSPECT]
 
 
@@ -697,9 +711,7 @@ class TerrainEstimator:
             raise TerrainError(f"{reading!r} is not allowed; allowed: finite numbers")
         state = TerrainState(state.numbers.copy(), state.sums.copy(), state.history.copy())
         results = np.empty((1, 1, RESULTS))
-        run_wheels(
-            self._tables, self._numbers, state.numbers, state.sums, state.history, values, dt, 1, results
-        )
+        run_wheels(self._tables, self._numbers, state.numbers, state.sums, state.history, values, dt, 1, results)
         return state, estimate_of(results[0, 0])
 
     def run(self, readings: FloatArray, dt: float, every: int = 1) -> FloatArray:

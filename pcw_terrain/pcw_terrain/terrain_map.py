@@ -1,8 +1,8 @@
 """Terrain pinned to places: a grid that remembers what was found where, so that a patch found once is known next time.
 
-A cell fuses the estimates made on it as independent ones, in log mu_p and log lambda_p. What is written is only what a wheel felt
-there and then: it slipped enough to know, and nothing contradicted it. A cell never becomes surer than `least_spread`, as the
-ground under a robot's wheels is not the same all over a cell; an estimate that contradicts a cell replaces it.
+A cell fuses the estimates made on it as independent ones, in log mu_p and log lambda_p. What is written is only what a wheel
+felt there and then: it slipped enough to know, and nothing contradicted it. A cell never becomes surer than `least_spread`, as
+the ground under a robot's wheels is not the same all over a cell; an estimate that contradicts a cell replaces it.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class TerrainMap:
         return int(np.count_nonzero(self._cells[:, :, 0]))
 
     def occupancy(self) -> np.ndarray:
-        """Return the map for nav_msgs/OccupancyGrid (height, width) int8: how slippery, 100 (1 - mu_p), 0 from mu_p = 1; -1 unknown."""
+        """Return how slippery it is (height, width) int8 for an OccupancyGrid: 100 (1 - mu_p), 0 from mu_p = 1; -1 unknown."""
         information, sums = self._cells[:, :, 0], self._cells[:, :, 1]
         grid = np.full(information.shape, UNKNOWN, dtype=np.int8)
         known = information > 0.0

@@ -83,7 +83,12 @@ def _advance(forgetting, rate, acceleration_rate, inertia, state, rolling, veloc
         sums[2] += phi1 * phi1
         determinant = sums[0] * sums[2] - sums[1] * sums[1]
         if determinant > LEAST_DETERMINANT:
-            q[0], q[1], q[2], q[3] = sums[2] / determinant, -sums[1] / determinant, -sums[1] / determinant, sums[0] / determinant
+            q[0], q[1], q[2], q[3] = (
+                sums[2] / determinant,
+                -sums[1] / determinant,
+                -sums[1] / determinant,
+                sums[0] / determinant,
+            )
             state[_FIRST + 4] = 1.0
         return
     q0, q1 = q[0] * phi0 + q[1] * phi1, q[2] * phi0 + q[3] * phi1
@@ -101,7 +106,16 @@ def _advance(forgetting, rate, acceleration_rate, inertia, state, rolling, veloc
 def _run(forgetting, rate, acceleration_rate, inertia, state, readings, dt, results):  # type: ignore[no-untyped-def]
     for k in range(len(readings)):
         _advance(
-            forgetting, rate, acceleration_rate, inertia, state, readings[k, 0], readings[k, 1], readings[k, 2], readings[k, 3], dt
+            forgetting,
+            rate,
+            acceleration_rate,
+            inertia,
+            state,
+            readings[k, 0],
+            readings[k, 1],
+            readings[k, 2],
+            readings[k, 3],
+            dt,
         )
         results[k, 0], results[k, 1] = state[_THETA], state[_THETA + 1]
 
@@ -156,9 +170,7 @@ class ThesisRls:
         if readings.ndim != 2 or readings.shape[1] < 4 or not np.isfinite(readings).all():
             raise TerrainError(f"readings of shape {readings.shape} are not allowed; allowed: finite numbers, shape (T, 4)")
         p, results = self.parameters, np.zeros((len(readings), 2))
-        _run(
-            p.forgetting_factor, p.filter_rate, p.acceleration_rate, p.inertia, self.initial_state(), readings, dt, results
-        )
+        _run(p.forgetting_factor, p.filter_rate, p.acceleration_rate, p.inertia, self.initial_state(), readings, dt, results)
         return curve_of(results)
 
 

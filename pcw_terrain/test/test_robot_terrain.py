@@ -79,7 +79,9 @@ def test_slip_across_is_slip_too():
 def test_a_caster_whose_slip_is_not_known_by_itself_says_nothing():
     terrain = RobotTerrain(THESIS)
     state, steady = terrain.initial_state(), np.zeros(4)
-    reading = RobotReading(np.full((4, 2), 0.5), np.full((4, 2), 0.05), np.full((4, 2), 50.0), steady, np.array([1, 0, 0, 0], bool))
+    reading = RobotReading(
+        np.full((4, 2), 0.5), np.full((4, 2), 0.05), np.full((4, 2), 50.0), steady, np.array([1, 0, 0, 0], bool)
+    )
     for _ in range(500):
         state, found = terrain.step(state, reading, 0.002)
     assert np.isfinite(found.mu_p[1:]).sum() == 0 and found.slip[0] > 0.0 and (found.slip[1:] == 0.0).all()

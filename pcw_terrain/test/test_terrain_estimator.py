@@ -11,7 +11,14 @@ from scipy.signal import lfilter
 
 from pcw_description import load_robot
 from pcw_description.contact.contact_model import friction_coefficient, tyre_parameters
-from pcw_terrain import TerrainError, TerrainEstimator, TerrainParameters, ThesisRls, ThesisRlsParameters, WheelReading
+from pcw_terrain import (
+    TerrainError,
+    TerrainEstimator,
+    TerrainParameters,
+    ThesisRls,
+    ThesisRlsParameters,
+    WheelReading,
+)
 from pcw_terrain.friction_shape import shape_at, shape_table
 from pcw_terrain.studies import terrain_study
 from pcw_terrain.studies.terrain_study import RATE, estimator_of, ground, readings_of, swept_run, thesis_run

@@ -16,6 +16,7 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
 from pcw_description.nodes.node_tools import ns_to_stamp, stamp_to_ns  # noqa: E402
+from pcw_terrain import RobotTerrain  # noqa: E402
 
 THESIS = load_robot("thesis")
 PERIOD = 0.002
@@ -37,6 +38,7 @@ class SlippingRobot:
         self.joints = ros.peer.create_publisher(JointState, "joint_states", 1000)
         self.slip = ros.peer.create_publisher(JointState, "slip/observer", 1000)
         self.odom = ros.peer.create_publisher(Odometry, "odom", 1000)
+        self.loads, self.force = RobotTerrain(THESIS), np.zeros((4, 2))
         self.slip_names = [f"{c}_{d}" for c in THESIS.caster_names for d in ("longitudinal", "lateral")]
 
     def publish(self, periods=10):
@@ -48,8 +50,9 @@ class SlippingRobot:
             slip = 1.0 * CRITICAL * (1.0 - math.cos(self.phase))
             rolling = self.speed / (1.0 - slip)
             self.roll += rolling / 0.075 * PERIOD
-            load = THESIS.total_mass * 9.81 / 4
-            force = self.force_sign * 2.0 * MU * CRITICAL * slip / (CRITICAL**2 + slip**2) * load
+            friction = self.force_sign * 2.0 * MU * CRITICAL * slip / (CRITICAL**2 + slip**2)
+            for _ in range(3):  # what the wheels push tilts the robot, and loads them by that
+                self.force[:, 0] = friction * self.loads.normal_force(np.zeros(4), self.force)
             stamp = ns_to_stamp(self.time_ns)
             odom = Odometry()
             odom.header.stamp, odom.header.frame_id = stamp, "odom"
@@ -58,11 +61,11 @@ class SlippingRobot:
             slips = JointState(name=self.slip_names)
             slips.header.stamp = stamp
             slips.position, slips.velocity = 4 * [slip, 0.0], 4 * [rolling - self.speed, 0.0]
-            slips.effort = 4 * [force, 0.0]
+            slips.effort = self.force.ravel().tolist()
             joints = JointState(name=list(THESIS.joint_names))
             joints.header.stamp = stamp
             joints.position, joints.velocity = 4 * [self.roll, 0.0], 4 * [rolling / 0.075, 0.0]
-            joints.effort = 4 * [force * 0.075, 0.0]
+            joints.effort = (0.075 * self.force).ravel().tolist()
             self.odom.publish(odom)
             self.slip.publish(slips)
             changed = self.change(joints)
@@ -134,7 +137,9 @@ def test_nan_gaps_and_missing_joints_are_told_and_nothing_of_it_is_sent(ros):
     robot.run(lambda: "lacks front_left_drive" in said(diagnostics))
     assert int(values_of(diagnostics)["unusable_joint_states"]) > 0
     robot.change = lambda message: message
+    robot.publish()
     robot.time_ns += 1_000_000_000
+    robot.publish()
     robot.run(lambda: int(values_of(diagnostics).get("gaps", 0)) >= 1)
     robot.time_ns -= 500_000_000
     robot.run(lambda: int(values_of(diagnostics).get("backward_jumps", 0)) >= 1)
@@ -153,7 +158,8 @@ def test_without_an_observer_it_says_what_it_waits_for_and_takes_odom_where_told
 
 
 @pytest.mark.parametrize(
-    ("parameter", "mentioned"), [("robot:=mpo700", "caster_offset"), ("source:=guess", "source"), ("map_resolution:=0.0", "map_resolution")]
+    ("parameter", "mentioned"),
+    [("robot:=mpo700", "caster_offset"), ("source:=guess", "source"), ("map_resolution:=0.0", "map_resolution")],
 )
 def test_what_cannot_work_ends_it_with_one_line(parameter, mentioned):
     result = subprocess.run(

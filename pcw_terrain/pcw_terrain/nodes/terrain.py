@@ -42,15 +42,17 @@ OLDEST = 0.05
 class TerrainNode(Node):
     """Steps the estimators on every joint_states and publishes at a lower rate.
 
-    terrain holds the casters whose ground is vouched for, and those that stand on a place of the map that is known. After a gap
-    or a jump back in time the estimators begin anew; the map stays.
+    terrain holds the casters whose ground is vouched for, and those that stand on a place of the map that is known. After a
+    gap or a jump back in time the estimators begin anew; the map stays.
     """
 
     def __init__(self) -> None:
         super().__init__("terrain")
         self.robot = load_robot(declare(self, "robot", "thesis", "robot file, or the name of a shipped robot", read_only=True))
         self._source = declare(self, "source", SOURCES[0], "where slip comes from", read_only=True, choices=SOURCES)
-        rate = declare(self, "publish_rate", 50.0, "rate of terrain; at most that of joint_states", "Hz", (0.1, 1e4), read_only=True)
+        rate = declare(
+            self, "publish_rate", 50.0, "rate of terrain; at most that of joint_states", "Hz", (0.1, 1e4), read_only=True
+        )
         map_rate = declare(self, "map_rate", 1.0, "rate of terrain/map", "Hz", (0.01, 100.0), read_only=True)
         resolution = declare(self, "map_resolution", 0.1, "side of a cell", "m", (0.01, 10.0), read_only=True)
         size = declare(self, "map_size", 40.0, "side of the map, about the origin of odom", "m", (1.0, 400.0), read_only=True)
@@ -69,7 +71,9 @@ class TerrainNode(Node):
         self._silence = Silence(self._watch)
         self._due, self._map_due = Decimator(rate), Decimator(map_rate)
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
-        directions = [f"{caster}_{direction}" for caster in self.robot.caster_names for direction in ("longitudinal", "lateral")]
+        directions = [
+            f"{caster}_{direction}" for caster in self.robot.caster_names for direction in ("longitudinal", "lateral")
+        ]
         self._slip_index = {name: i for i, name in enumerate(directions)}
         self._publisher = self.create_publisher(JointState, "terrain", SENSOR_SOURCE)
         self._map_publisher = self.create_publisher(OccupancyGrid, "terrain/map", LATCHED)
@@ -123,7 +127,9 @@ class TerrainNode(Node):
     def _step(self, now: int, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float) -> bool:
         """Step the estimators; returns whether there was something to step them with."""
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-            missing = [name for name, i in self._joint_index.items() if not np.isfinite(position.ravel()[i] + velocity.ravel()[i])]
+            missing = [
+                name for name, i in self._joint_index.items() if not np.isfinite(position.ravel()[i] + velocity.ravel()[i])
+            ]
             raise TerrainError(f"joint_states lacks {', '.join(missing)}; allowed: all joints, finite position and velocity")
         newest = self._slip if self._source == "observer" else self._odom
         if newest is None or abs(now - newest[0]) * 1e-9 > OLDEST:
@@ -156,7 +162,7 @@ class TerrainNode(Node):
             self._map.add(places[i, 0], places[i, 1], estimate.mu_p[i], estimate.lambda_p[i], estimate.covariance[i])
 
     def _known(self, estimate: RobotTerrainEstimate, now: int) -> dict[str, tuple[float, float, float]]:
-        """Return lambda_p, current slip and mu_p of the casters whose ground is known, from estimates and else from the map."""
+        """Return lambda_p, current slip and mu_p of casters whose ground is known, from estimates or else from the map."""
         places, found = self._places(now), {}
         for i, name in enumerate(self.robot.caster_names):
             if estimate.valid[i]:
@@ -191,7 +197,11 @@ class TerrainNode(Node):
         if estimate is None:
             return {}
         for i, name in enumerate(self.robot.caster_names):
-            values = {"slip": float(estimate.slip[i]), "friction": float(estimate.friction[i]), "changes": int(estimate.changes[i])}
+            values = {
+                "slip": float(estimate.slip[i]),
+                "friction": float(estimate.friction[i]),
+                "changes": int(estimate.changes[i]),
+            }
             if not estimate.valid[i]:
                 wrong = "wrong sign" in estimate.reason[i] or "does not fit" in estimate.reason[i]
                 parts[name] = Status(WARN if wrong else OK, estimate.reason[i], values)
@@ -210,7 +220,11 @@ class TerrainNode(Node):
         values |= {"known_cells": self._map.known}
         problems, estimate = self._problems.take(), self._estimate
         if estimate is not None and estimate.valid.any():
-            values |= {"robot_mu_p": float(estimate.robot[0]), "robot_lambda_p": float(estimate.robot[1]), "uniform": estimate.uniform}
+            values |= {
+                "robot_mu_p": float(estimate.robot[0]),
+                "robot_lambda_p": float(estimate.robot[1]),
+                "uniform": estimate.uniform,
+            }
         if problems:
             return Status(WARN, problems, values)
         if self._silence.since_last_report():

@@ -13,7 +13,15 @@ import math
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import LAMBDA, LATERAL_LAMBDA, LATERAL_MU, LENGTH, MU, tyre_parameters, tyre_step
+from pcw_description.contact.contact_model import (
+    LAMBDA,
+    LATERAL_LAMBDA,
+    LATERAL_MU,
+    LENGTH,
+    MU,
+    tyre_parameters,
+    tyre_step,
+)
 from pcw_description.robot_description import ContactDescription, FloatArray
 
 SUBSTEP = 1e-4  # of the integration [s]
@@ -128,12 +136,12 @@ def run_wheel(
         given, held, np.full(count, velocity), substeps, period / substeps, motion,
     )  # fmt: skip
     motion[0, 2:] = motion[1, 2:]
-    time = period * np.arange(count)
+    time: FloatArray = period * np.arange(count, dtype=float)
     if torque is None:
         given = wheel.inertia * np.gradient(motion[:, 0], period) + wheel.radius * motion[:, 2]
     high = sum(np.sin(math.tau * f * time + rng.uniform(0.0, math.tau)) for f in (110.0, 170.0, 230.0))
     measured_torque = given + harmonics * np.abs(given).max() * high
-    rolling = wheel.radius * motion[:, 0]
+    rolling: FloatArray = wheel.radius * motion[:, 0]
     return GroundRun(
         time, rolling, motion[:, 1], motion[:, 2], motion[:, 3],
         rolling * (1.0 + noise * rng.uniform(-1.0, 1.0, count)),

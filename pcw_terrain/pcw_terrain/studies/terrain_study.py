@@ -44,9 +44,7 @@ EVERY = 10  # readings between results that are looked at
 def ground(mu_p: float, lambda_p: float, relaxation: float = 0.02) -> ContactDescription:
     """Return a Kiencke contact, the same in all directions."""
     lateral = LateralContact(mu_p=mu_p, lambda_p=lambda_p)
-    return ContactDescription(
-        model="kiencke", mu_p=mu_p, lambda_p=lambda_p, lateral=lateral, relaxation_length=relaxation
-    )
+    return ContactDescription(model="kiencke", mu_p=mu_p, lambda_p=lambda_p, lateral=lateral, relaxation_length=relaxation)
 
 
 def readings_of(wheel: GroundWheel, run: GroundRun) -> FloatArray:
@@ -127,8 +125,16 @@ def _accuracy(errors: list[tuple[float, float]], spreads: list[tuple[float, floa
     (mu, critical), (mu_worst, critical_worst) = np.median(size, axis=0), np.quantile(size, 0.95, axis=0, method="lower")
     mu_bias, critical_bias = np.median(sign, axis=0)
     return Accuracy(
-        len(good), int(good.sum()), float(mu), float(critical), float(mu_worst), float(critical_worst), float(mu_bias),
-        float(critical_bias), float(covered[0]), float(covered[1]),
+        len(good),
+        int(good.sum()),
+        float(mu),
+        float(critical),
+        float(mu_worst),
+        float(critical_worst),
+        float(mu_bias),
+        float(critical_bias),
+        float(covered[0]),
+        float(covered[1]),
     )
 
 
@@ -143,7 +149,13 @@ def accuracy(runs: Sequence[tuple[GroundWheel, GroundRun]], forgetting_factors: 
         readings = readings_of(wheel, run)
         last = estimator_of(wheel).run(readings, 1.0 / RATE, EVERY)[-1]
         results = {
-            "ours": (last[MU_P], last[LAMBDA_P], math.sqrt(last[MU_VARIANCE]), math.sqrt(last[LAMBDA_VARIANCE]), last[IS_VALID])
+            "ours": (
+                last[MU_P],
+                last[LAMBDA_P],
+                math.sqrt(last[MU_VARIANCE]),
+                math.sqrt(last[LAMBDA_VARIANCE]),
+                last[IS_VALID],
+            )
         }
         for factor in forgetting_factors:
             printed = ThesisRls(ThesisRlsParameters(factor, inertia=wheel.inertia / wheel.radius**2))
@@ -246,7 +258,9 @@ def figures(out: Path) -> list[str]:
     wheel, run = thesis_run(0, THESIS_MU, THESIS_LAMBDA)
     readings = readings_of(wheel, run)
     inertia = wheel.inertia / wheel.radius**2
-    printed = {factor: ThesisRls(ThesisRlsParameters(factor, inertia=inertia)).run(readings, 1.0 / RATE) for factor in (0.8, 0.999)}
+    printed = {
+        factor: ThesisRls(ThesisRlsParameters(factor, inertia=inertia)).run(readings, 1.0 / RATE) for factor in (0.8, 0.999)
+    }
     found = estimator_of(wheel).run(readings, 1.0 / RATE)
     lines = []
     for name, index, column, truth, label in (
@@ -278,13 +292,19 @@ def figures(out: Path) -> list[str]:
             axes.set(xlabel="time [s]", ylabel=label, ylim=(0.0, 2.5 * truth), title=f"Fig. {name[4:].replace('_', '.')}")
             axes.legend(loc="upper right", fontsize=8)
             figure.savefig(out / f"{name}.svg", metadata={"Date": None})
-        end = {factor: float(np.nanmedian(printed[factor][index][-2000:])) for factor in printed}
+        end = {factor: _middle(printed[factor][index][-2000:]) for factor in printed}
         lines.append(
-            f"![Fig. {name[4:].replace('_', '.')}]({name}.svg) Fig. {name[4:].replace('_', '.')}, {label} ([data]({name}.csv)): "
-            f"truth {truth:g}; as printed {end[0.8]:.3g} with forgetting 0.8 and {end[0.999]:.3g} with 0.999 (medians of the last "
+            f"![Fig. {name[4:].replace('_', '.')}]({name}.svg) Fig. {name[4:].replace('_', '.')}, {label} "
+            f"([data]({name}.csv)): "
+            f"truth {truth:g}; as printed {end[0.8]} with forgetting 0.8 and {end[0.999]} with 0.999 (medians of the last "
             f"two seconds); ours {ours[-1]:.4g}, 95 % within {low[-1]:.4g} to {high[-1]:.4g}.\n"
         )
     return lines
+
+
+def _middle(values: FloatArray) -> str:
+    known = values[np.isfinite(values)]
+    return f"{float(np.median(known)):.3g}" if len(known) else "no number"
 
 
 def _row(name: str, a: Accuracy) -> str:
@@ -293,21 +313,27 @@ def _row(name: str, a: Accuracy) -> str:
 
     coverage = "-" if math.isnan(a.mu_coverage) else f"{a.mu_coverage:.0%} | {a.lambda_coverage:.0%}"
     return (
-        f"| {name} | {a.reached} | {a.valid if coverage != '-' else '-'} | {percent(a.mu_error)} | {percent(a.lambda_error)} | "
+        f"| {name} | {a.reached} | {a.valid if coverage != '-' else '-'} | {percent(a.mu_error)} | "
+        f"{percent(a.lambda_error)} | "
         f"{percent(a.mu_worst)} | {percent(a.lambda_worst)} | {percent(a.mu_bias)} | {percent(a.lambda_bias)} | "
         f"{coverage if coverage != '-' else '- | -'} |"
     )
 
 
 ACCURACY_HEAD = (
-    "| estimator | runs | valid | median error mu_p | lambda_p | 95th percentile mu_p | lambda_p | bias mu_p | lambda_p | 95 % "
+    "| estimator | runs | valid | median error mu_p | lambda_p | 95th percentile mu_p | lambda_p | bias "
+    "mu_p | lambda_p | 95 % "
     "intervals hold mu_p | lambda_p |\n|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
 def _times(name: str, values: FloatArray) -> str:
     quantiles = np.quantile(values, [0.5, 0.9, 0.95, 1.0], method="higher")
-    return f"| {name} | " + " | ".join(f"{value:.2f} s" for value in quantiles) + f" | {int(np.isinf(values).sum())} |"
+    return (
+        f"| {name} | "
+        + " | ".join(f"{value:.2f} s" if math.isfinite(value) else "never" for value in quantiles)
+        + f" | {int(np.isinf(values).sum())} |"
+    )
 
 
 def document(seeds: range, out: Path) -> str:
@@ -329,14 +355,16 @@ def document(seeds: range, out: Path) -> str:
         "",
         f"Written by `python -m pcw_terrain.studies.terrain_study --seeds {len(seeds)}`; nothing here is typed in.",
         "",
-        f"Readings at {RATE:g} Hz; the measured rolling speed and velocity each have a uniform error of +-10 %, fresh in every "
+        f"Readings at {RATE:g} Hz; the measured rolling speed and velocity each have a uniform error of +-10 "
+        "%, fresh in every "
         "reading, and the torque three harmonics above 100 Hz of 2 % of its amplitude. Ours knows the wheel and its tyre's "
         "relaxation length; nothing of mu_p and lambda_p.",
         "",
         "## Figures 5.19 and 5.20",
         "",
         *figures(out),
-        "The thesis gives no number for the ground or the torque; mu_p = 0.8 and lambda_p = 0.1 are those of our thesis robot.",
+        "The thesis gives no number for the ground or the torque; mu_p = 0.8 and lambda_p = 0.1 are those of "
+        "our thesis robot.",
         "",
         "## Accuracy, on the same data",
         "",
@@ -359,7 +387,8 @@ def document(seeds: range, out: Path) -> str:
         "",
         "## Change of ground",
         "",
-        "mu_p from 0.8 to 0.2 and back, lambda_p by up to a quarter as well, while the slip swings about lambda_p by a half of "
+        "mu_p from 0.8 to 0.2 and back, lambda_p by up to a quarter as well, while the slip swings about "
+        "lambda_p by a half of "
         "it, 1 to 3 times a second. Settled: mu_p within 5 % and valid, from then on.",
         "",
         "| | median | 90th percentile | 95th | worst | never |",
