@@ -148,6 +148,7 @@ def test_nan_gaps_and_missing_joints_are_told_and_nothing_of_it_is_sent(ros):
     assert finite(terrain)
 
 
+@pytest.mark.nightly  # two processes
 def test_without_an_observer_it_says_what_it_waits_for_and_takes_odom_where_told(ros):
     _, _, diagnostics, robot = start(ros)
     ros.wait_for(lambda: "no joint_states" in said(diagnostics) or "no slip/observer" in said(diagnostics))
