@@ -34,11 +34,12 @@ setup(
     zip_safe=False,
     maintainer="PCW maintainers",
     maintainer_email="pcw-maintainers@example.org",
-    description="Terrain for powered-caster robots: a catalogue of grounds with their friction parameters.",
+    description="Terrain for powered-caster robots: grounds and their friction, identified while driving.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             "grounds = pcw_terrain.ground_catalogue:main",
+            "terrain = pcw_terrain.nodes.terrain:main",
         ],
     },
 )

@@ -1,0 +1,338 @@
+"""Terrain from joint angles and torques alone, and slip on purpose, on whole robots.
+
+    python -m pcw_sim_bridge.terrain_study [--seeds 10] [--plants reduced pybullet] [--out pcw_terrain/docs/terrain_robot.md]
+
+A robot follows a straight line at 0.3 m/s by computed torque; then one caster after another is made to slip through the
+internal forces (`pcw_terrain.active_identification`). Nobody knows the ground: controller, observer and identification believe
+in the robot file's, the plant has another one. Forces and, in the version by angle, all speeds come from the sliding-mode
+observer and the angles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement
+from pcw_control.computed_torque import initial_state as initial_control
+from pcw_control.quintic_trajectory import TrajectoryPoint
+from pcw_control.torque_limits import TorqueLimits, limit_torque
+from pcw_description.odometry import OdometryParameters, OdometryState, update
+from pcw_description.odometry import initial_state as initial_odometry
+from pcw_description.robot_description import STEER, ContactDescription, FloatArray, RobotDescription
+from pcw_description.robot_file import load_robot
+from pcw_estimation.robot_sliding_mode_observer import RobotSlidingModeObserver
+from pcw_estimation.sliding_mode_observer import SlidingModeParameters
+from pcw_estimation.slip_estimate import JointMeasurement
+from pcw_terrain.active_identification import ActiveIdentification, ActiveMeasurement, ActiveOutput, Phase
+from pcw_terrain.active_record import ActiveRecord
+from pcw_terrain.robot_terrain import RobotTerrain, RobotTerrainEstimate
+
+from .plants.factory import make_plant
+from .sensors import JointReading
+from .simulated_robot import JointCommand, SimulatedRobot
+
+SPEED, UNDER_WAY, REQUESTED = 0.3, 1.0, 1.5  # [m/s], until it moves steadily [s], when slip is asked for [s]
+LONGEST, AFTERWARDS = 8.0, 0.4  # of a run, and after the last test [s]
+ROBOT = "thesis"
+
+
+def on_ground(robot: RobotDescription, mu_p: float, lambda_p: float) -> RobotDescription:
+    """Return the robot on another ground, the same in all directions; the tyre stays."""
+
+    def changed(contact: ContactDescription) -> ContactDescription:
+        lateral = dataclasses.replace(contact.lateral, mu_p=mu_p, lambda_p=lambda_p)
+        return dataclasses.replace(contact, mu_p=mu_p, lambda_p=lambda_p, lateral=lateral)
+
+    return dataclasses.replace(robot, contact=changed(robot.contact))
+
+
+@dataclasses.dataclass(frozen=True)
+class ActiveRun:
+    """What one run found.
+
+    Attributes:
+        mu_p, lambda_p: per caster (n,) [1]; NaN where nothing was found.
+        covariance: of their logarithms (n, 2, 2).
+        valid: per caster (n,).
+        duration: from the request to the end of the last test [s].
+        refusal: why it ended early, in words; "" if it did not.
+        along, across: greatest distance of base_link from where it should be, on its line and beside it [m].
+        yaw: greatest turn [rad].
+        predicted_path: what had been predicted of one test [m].
+    """
+
+    mu_p: FloatArray
+    lambda_p: FloatArray
+    covariance: FloatArray
+    valid: np.ndarray
+    duration: float
+    refusal: str
+    along: float
+    across: float
+    yaw: float
+    predicted_path: float
+
+
+def line(now: float, heading: float) -> TrajectoryPoint:
+    """Return the point at a time [s] of a straight line that is begun at rest."""
+    s = min(now / UNDER_WAY, 1.0)
+    way = SPEED * (UNDER_WAY * (s**3 - 0.5 * s**4) + max(now - UNDER_WAY, 0.0))
+    velocity, acceleration = SPEED * s * s * (3.0 - 2.0 * s), SPEED * 6.0 * s * (1.0 - s) / UNDER_WAY
+    direction = np.array([np.cos(heading), np.sin(heading), 0.0])
+    return TrajectoryPoint(way * direction, velocity * direction, acceleration * direction)
+
+
+class _Knowledge:
+    """What is believed of the ground under each caster: what its test said, else the mean of the others', else the file's."""
+
+    def __init__(self, robot: RobotDescription) -> None:
+        n = robot.n
+        self.mu_p, self.lambda_p = np.full(n, np.nan), np.full(n, np.nan)
+        self.covariance = np.full((n, 2, 2), np.inf)
+        self.valid, self._file = np.zeros(n, dtype=bool), robot
+
+    def believed(self) -> tuple[FloatArray, FloatArray]:
+        mu_p = np.array([tyre.mu_p for tyre in self._file.tyres])
+        lambda_p = np.array([tyre.lambda_p for tyre in self._file.tyres])
+        if self.valid.any():
+            mu_p[:] = np.exp(np.mean(np.log(self.mu_p[self.valid])))
+            lambda_p[:] = np.exp(np.mean(np.log(self.lambda_p[self.valid])))
+        return np.where(self.valid, self.mu_p, mu_p), np.where(self.valid, self.lambda_p, lambda_p)
+
+
+def _shifted(odometry: OdometryState, moved: FloatArray) -> OdometryState:
+    """Return the odometry after a motion (3,) in base_link that it had missed."""
+    c, s = np.cos(odometry.pose[2]), np.sin(odometry.pose[2])
+    shift = np.array([c * moved[0] - s * moved[1], s * moved[0] + c * moved[1], moved[2]])
+    return dataclasses.replace(odometry, pose=odometry.pose + shift)
+
+
+def active_run(
+    real: RobotDescription, believed: RobotDescription, plant: str, seed: int, measured: str = "angle", heading: float = 0.0
+) -> ActiveRun:
+    """Drive a robot along a line and identify the ground under every caster.
+
+    Args:
+        real: as it really is.
+        believed: what everything that computes believes.
+        plant: name of the plant.
+        seed: of the sensor noise.
+        measured: "angle", joint angles and torques alone, or "speed".
+        heading: of the line [rad]; the casters begin turned that way.
+    """
+    n = believed.n
+    inner = make_plant(plant, real)
+    inner.reset(steer_angle=np.full(n, heading))
+    simulated = SimulatedRobot(inner, seed)
+    controller, control = ComputedTorque(believed), initial_control()
+    limits, torque, asked = TorqueLimits.of_robot(believed), np.zeros((n, 2)), np.zeros((n, 2))
+    observer = RobotSlidingModeObserver(believed, SlidingModeParameters(measured=measured))
+    observed = observer.initial_state()
+    terrain, active = RobotTerrain(believed), ActiveIdentification(believed)
+    record, testing, live = ActiveRecord(terrain, active), active.initial_state(), terrain.initial_state()
+    odometry, odometry_parameters = initial_odometry(), OdometryParameters()
+    knowledge, output, position_before = _Knowledge(believed), None, None
+    saturated, before, requested, ended, predicted = False, -1, False, 0.0, 0.0
+    errors: list[FloatArray] = []
+    while simulated.time_ns < LONGEST * 1e9:
+        reading = list(simulated.advance())[-1].reading
+        assert isinstance(reading, JointReading)  # the joints come last
+        dt = (simulated.time_ns - before) * 1e-9 if before >= 0 else simulated.control_period
+        before, now = simulated.time_ns, simulated.time_ns * 1e-9
+        velocity = reading.velocity
+        if measured == "angle":
+            velocity = np.zeros((n, 2)) if position_before is None else (reading.position - position_before) / dt
+        position_before = reading.position
+        observed, estimate = observer.step(observed, JointMeasurement(reading.position, reading.velocity, reading.effort), dt)
+        loads = terrain.normal_force(np.ascontiguousarray(reading.position[:, STEER]), estimate.force)
+        mu_p, lambda_p = knowledge.believed()
+        measurement = ActiveMeasurement(
+            reading.position, velocity, estimate.force, asked, loads, knowledge.valid.copy(), mu_p, lambda_p
+        )
+        if not requested and now >= REQUESTED:
+            testing, requested = active.request(testing), True
+            predicted = active.predict(reading.position[:, STEER], 0, loads).path
+        under_test = output.testing if output is not None else -1
+        if under_test >= 0:
+            record.add(measurement, reading.effort, dt)
+            assert output is not None
+            live, now_known = terrain.step_with_twist(
+                live, reading.position, velocity, reading.effort, output.twist, dt, np.arange(n) == under_test
+            )
+            measurement = _with_live(measurement, now_known, under_test)
+        testing, output = active.step(testing, measurement, dt)
+        if under_test >= 0 and output.testing != under_test:
+            odometry, live = _learn(record, under_test, knowledge, odometry), terrain.initial_state()
+        odometry, _ = update(believed, odometry_parameters, odometry, output.controller_position, dt)
+        seen = ComputedTorqueMeasurement(
+            output.controller_position, _speeds(output, reading, measured), odometry.pose, saturated
+        )
+        point = line(now, heading)
+        control, wanted = controller.step(control, seen, point, dt)
+        asked = wanted.torque
+        limited = limit_torque(limits, torque, asked + output.torque, reading.velocity, dt)
+        torque, saturated = limited.torque, limited.saturated
+        simulated.command(JointCommand(effort=torque))
+        errors.append(np.array([now, *(simulated.plant.state().pose - point.pose)]))
+        if requested and testing.phase in (Phase.DONE, Phase.REFUSED):
+            ended = ended or now
+            if now > ended + AFTERWARDS:
+                break
+    simulated.close()
+    error = np.array(errors)
+    error = error[error[:, 0] >= REQUESTED] - np.array([0.0, *error[np.argmax(error[:, 0] >= REQUESTED), 1:]])
+    c, s = np.cos(heading), np.sin(heading)
+    return ActiveRun(
+        knowledge.mu_p, knowledge.lambda_p, knowledge.covariance, knowledge.valid,
+        (ended or LONGEST) - REQUESTED, testing.refusal.value,
+        float(np.abs(c * error[:, 1] + s * error[:, 2]).max()), float(np.abs(c * error[:, 2] - s * error[:, 1]).max()),
+        float(np.abs(error[:, 3]).max()), predicted,
+    )  # fmt: skip
+
+
+def _speeds(output: ActiveOutput, reading: JointReading, measured: str) -> FloatArray:
+    """Return the joint speeds that the controller is given; its own drives measure them, whatever the observer does."""
+    if measured == "speed" or output.testing >= 0:
+        return output.controller_velocity
+    return reading.velocity
+
+
+def _with_live(measurement: ActiveMeasurement, found: RobotTerrainEstimate, caster: int) -> ActiveMeasurement:
+    """Return the measurement with what is known already of the caster under test, so that its test ends in time."""
+    if not found.valid[caster]:
+        return measurement
+    at = np.arange(len(measurement.known)) == caster
+    return dataclasses.replace(
+        measurement, known=measurement.known | at, mu_p=np.where(at, found.mu_p, measurement.mu_p),
+        lambda_p=np.where(at, found.lambda_p, measurement.lambda_p),
+    )  # fmt: skip
+
+
+def _learn(record: ActiveRecord, caster: int, knowledge: _Knowledge, odometry: OdometryState) -> OdometryState:
+    """Take what a test says into what is known; returns the odometry with what it had missed."""
+    _, found, moved = record.identify(caster)
+    record.clear()
+    if not found.valid[caster]:
+        return odometry
+    knowledge.mu_p[caster], knowledge.lambda_p[caster] = found.mu_p[caster], found.lambda_p[caster]
+    knowledge.covariance[caster], knowledge.valid[caster] = found.covariance[caster], True
+    return _shifted(odometry, moved)
+
+
+def random_ground(seed: int) -> tuple[float, float]:
+    """Return mu_p and lambda_p of a ground that nobody knows."""
+    rng = np.random.default_rng([seed, 53])
+    return float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.06, 0.18))
+
+
+@dataclasses.dataclass(frozen=True)
+class ActiveSummary:
+    """Many runs; errors are relative, of all casters of all runs that gave a valid estimate."""
+
+    tests: int
+    valid: int
+    mu_median: float
+    mu_worst: float
+    lambda_median: float
+    lambda_worst: float
+    covered: tuple[float, float]
+    slowest: float
+    path_median: float
+    path_worst: float
+    yaw_worst: float
+    predicted: float
+    refusals: tuple[str, ...]
+
+
+def summarise(grounds: Sequence[tuple[float, float]], runs: Sequence[ActiveRun]) -> ActiveSummary:
+    """Return the figures of runs on these grounds."""
+    mu, critical, spread = [], [], []
+    for (mu_p, lambda_p), run in zip(grounds, runs, strict=True):
+        for index in np.nonzero(run.valid)[0]:
+            mu.append(np.log(run.mu_p[index] / mu_p))
+            critical.append(np.log(run.lambda_p[index] / lambda_p))
+            spread.append(np.sqrt(np.diag(run.covariance[index])))
+    error = np.abs(np.column_stack([mu, critical])) if mu else np.full((1, 2), np.nan)
+    covered = (error <= 1.96 * np.array(spread)).mean(axis=0) if mu else np.full(2, np.nan)
+    path = np.array([np.hypot(run.along, run.across) for run in runs])
+    return ActiveSummary(
+        sum(len(run.valid) for run in runs), len(mu), float(np.median(error[:, 0])), float(error[:, 0].max()),
+        float(np.median(error[:, 1])), float(error[:, 1].max()), (float(covered[0]), float(covered[1])),
+        max(run.duration for run in runs), float(np.median(path)), float(path.max()), max(run.yaw for run in runs),
+        float(np.median([run.predicted_path for run in runs])), tuple(run.refusal for run in runs if run.refusal),
+    )  # fmt: skip
+
+
+def document(plants: Sequence[str], seeds: int) -> str:
+    """Return the text of terrain_robot.md."""
+    believed = load_robot(ROBOT)
+    parts = [
+        "# Terrain of whole robots",
+        "",
+        f"Written by `python -m pcw_sim_bridge.terrain_study --seeds {seeds}`; nothing here is typed in.",
+        "",
+        f"The `{ROBOT}` robot follows a straight line at {SPEED:g} m/s and is asked to identify the ground "
+        "under every caster by "
+        "letting one after the other slip. mu_p is drawn from 0.3 to 0.8 and lambda_p from 0.06 to 0.18; everything that "
+        "computes believes in 0.8 and 0.1 at first. `angle`: joint angles and motor torques are all that observer and "
+        "identification are given. The path's error is that of base_link against its line, along and across "
+        "together, from the "
+        "request until after the last test.",
+        "",
+        "| plant | measured | tests | valid | mu_p: median error | worst | lambda_p: median | worst | 95 % "
+        "intervals hold mu_p, "
+        "lambda_p | slowest, all casters | path: median | worst | yaw, worst | path predicted, one test | ended early |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for plant in plants:
+        for measured in ("angle", "speed"):
+            grounds = [random_ground(seed) for seed in range(seeds)]
+            started = time.perf_counter()
+            runs = [
+                active_run(on_ground(believed, *ground), believed, plant, seed, measured)
+                for seed, ground in enumerate(grounds)
+            ]
+            s = summarise(grounds, runs)
+            parts.append(
+                f"| {plant} | {measured} | {s.tests} | {s.valid} | {s.mu_median:.1%} | {s.mu_worst:.1%} | "
+                f"{s.lambda_median:.1%} | "
+                f"{s.lambda_worst:.1%} | {s.covered[0]:.0%}, {s.covered[1]:.0%} | {s.slowest:.2f} s | "
+                f"{1e3 * s.path_median:.1f} mm | "
+                f"{1e3 * s.path_worst:.1f} mm | {1e3 * s.yaw_worst:.1f} mrad | {1e3 * s.predicted:.1f} mm | "
+                f"{'; '.join(sorted(set(s.refusals))) or '-'} |"
+            )
+            print(parts[-1], f"({time.perf_counter() - started:.0f} s)", flush=True)
+    parts += [
+        "",
+        "A test needs a motor that can take its wheel past the ground's hold: the drives of `tidybot2` and "
+        "`dyros_pcv` cannot on "
+        "good ground, and are refused there with that reason.",
+        "",
+    ]
+    return "\n".join(parts)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study and write what it finds."""
+    parser = argparse.ArgumentParser(prog="terrain_study", description="Identify the ground under whole robots.")
+    parser.add_argument("--seeds", type=int, default=10, help="runs per plant (default: %(default)s)")
+    parser.add_argument("--plants", nargs="+", default=["reduced", "pybullet"], help="plants (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("pcw_terrain/docs/terrain_robot.md"), help="file to write")
+    options = parser.parse_args(arguments)
+    if options.seeds < 1:
+        parser.error(f"argument --seeds: {options.seeds} is not allowed; allowed: at least 1")
+    text = document(options.plants, options.seeds)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""Ground that nobody knows, found from angles and torques by slip on purpose: robot, observer and plant together."""
+
+import numpy as np
+import pytest
+
+from pcw_description import load_robot
+from pcw_sim_bridge import terrain_study
+from pcw_sim_bridge.terrain_study import active_run, on_ground, random_ground, summarise
+
+THESIS = load_robot("thesis")
+
+
+def check(run, mu_p, lambda_p, slip_error=0.12):
+    assert run.refusal == "" and run.valid.all()
+    assert np.abs(run.mu_p / mu_p - 1.0).max() < 0.06
+    assert np.median(np.abs(run.lambda_p / lambda_p - 1.0)) < slip_error
+    assert run.duration <= 4.0
+
+
+def test_the_ground_is_found_from_angles_and_torques_and_the_path_is_kept():
+    """The robot file says 0.8 and 0.1; the ground is another one."""
+    run = active_run(on_ground(THESIS, 0.55, 0.08), THESIS, "reduced", 3, "angle")
+    check(run, 0.55, 0.08)
+    assert max(run.along, run.across) < 0.005
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("measured", ["angle", "speed"])
+@pytest.mark.parametrize("seed", [2, 4])
+def test_another_engine_gives_the_same(seed, measured):
+    ground = random_ground(seed)
+    check(active_run(on_ground(THESIS, *ground), THESIS, "pybullet", seed, measured), *ground)
+
+
+def test_drives_that_are_too_weak_to_slip_are_told_and_the_robot_drives_on():
+    tidybot = load_robot("tidybot2")
+    run = active_run(tidybot, tidybot, "reduced", 0, "speed")
+    assert "not enough torque" in run.refusal and not run.valid.any()
+    assert max(run.along, run.across) < 0.002
+
+
+@pytest.mark.nightly
+def test_the_direction_makes_no_difference():
+    check(active_run(on_ground(THESIS, 0.55, 0.08), THESIS, "reduced", 1, "speed", heading=0.5), 0.55, 0.08)
+
+
+def test_a_summary_counts_what_was_found():
+    run = terrain_study.ActiveRun(
+        np.array([0.5, 0.6, np.nan, 0.5]), np.array([0.1, 0.1, np.nan, 0.12]), np.tile(0.01 * np.eye(2), (4, 1, 1)),
+        np.array([True, True, False, True]), 3.0, "cancelled", 3e-3, 4e-3, 1e-3, 3e-3,
+    )  # fmt: skip
+    found = summarise([(0.5, 0.1)], [run])
+    assert (found.tests, found.valid, found.refusals) == (4, 3, ("cancelled",))
+    assert found.mu_median == 0.0 and found.mu_worst == pytest.approx(np.log(1.2))
+    assert found.path_worst == pytest.approx(5e-3) and found.covered == (1.0, pytest.approx(1.0))
+
+
+def test_the_study_writes_its_document(tmp_path, monkeypatch):
+    run = terrain_study.ActiveRun(
+        np.full(4, 0.5),
+        np.full(4, 0.1),
+        np.tile(0.01 * np.eye(2), (4, 1, 1)),
+        np.ones(4, bool),
+        3.0,
+        "",
+        1e-3,
+        2e-3,
+        1e-3,
+        3e-3,
+    )
+    monkeypatch.setattr(terrain_study, "active_run", lambda *_: run)
+    out = tmp_path / "robots.md"
+    assert terrain_study.main(["--seeds", "2", "--plants", "reduced", "--out", str(out)]) == 0
+    rows = [line for line in out.read_text().splitlines() if line.startswith("| reduced")]
+    assert len(rows) == 2 and "3.00 s" in rows[0]

@@ -1,0 +1,1 @@
+"""ROS nodes of pcw_terrain: thin layers over the cores."""

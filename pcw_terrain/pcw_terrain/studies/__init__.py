@@ -1,0 +1,1 @@
+"""Studies of the terrain estimators, which write their documents."""

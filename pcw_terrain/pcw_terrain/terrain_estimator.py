@@ -1,0 +1,734 @@
+"""Peak friction and critical slip of the ground under one wheel, while it drives: unbiased, with its uncertainty.
+
+    mu = mu_p g(lambda / lambda_p),     g(x) = 2 x / (1 + x^2) for Kiencke's curve (3.47) [Li2009]
+
+Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (see `thesis_rls`). Here
+
+- all signals pass the same filter, two poles, and so does the derivative of the wheel's speed that (3.45) needs;
+- the slip is relaxed over the tyre's relaxation length like the force is;
+- the filtered signals are sampled so far apart that their noise is independent, as blocks;
+- the noise of speeds and torques is measured from their second differences, and with it the filtered slip's, s, in lambda_p.
+  It bends the curve's mean by g'' s^2 / 2, which is taken off:    g_c = g(x) - g''(x) s^2 / 2;
+  The curve's mean is bent as well by slip that moves within the filter's memory, which is put back;
+- the equations are solved with an instrument, the mean of the slip two blocks before and after, whose noise is another one
+  (further off where the tyre's relaxation carries noise along):
+
+      sum w z (mu_k - mu_p g_c(x_k)) = 0,    sum w a (mu_k - mu_p g_c(x_k)) = 0,    z = g(x_i),  a = -x_i g'(x_i),
+
+  with the effective variance 1/w = s_mu^2 + mu_p^2 s^2 (g'^2 + g''^2 s^2) at the instrument's x_i. The sums are kept for a
+  grid of lambda_p, so that nothing is linearised and nothing can diverge: mu_p follows from the first equation, lambda_p is
+  where the second one holds, nearest to the least weighted error.
+
+The covariance is that of these equations, with the variance and the correlation of the residuals as they are. An estimate is
+valid when it is narrow enough, the slip has been beyond `least_slip` of the largest lambda_p that it allows, and the force
+acted along the slip and not against it. Residuals that add up to a jump mean that the ground changed: the estimate then
+begins anew from the blocks since.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from pcw_description.compiled import compiled
+from pcw_description.contact.contact_model import DAMPING_TIME
+from pcw_description.robot_description import ContactDescription, FloatArray
+
+from .errors import TerrainError, require, require_dt
+from .friction_shape import shape_at, shape_table
+
+# Bounds of physics: rubber, felt or ice on any floor.
+LEAST_FRICTION, GREATEST_FRICTION = 0.02, 2.0
+LEAST_CRITICAL_SLIP, GREATEST_CRITICAL_SLIP = 0.01, 0.8
+GRID = 64
+# A pole of the filter for a cut-off (-3 dB) of two equal ones, and the time between blocks in units of its time constant.
+POLE_PER_CUT_OFF, BLOCK_TIME_CONSTANTS = 2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0), 4.0
+# Of a mean over a block, relative to the filtered signal: the variance of the difference of its ends, and the spread of what
+# moves steadily through filter and block, in units of its way from block to block.
+_DECAY = math.exp(-BLOCK_TIME_CONSTANTS)
+BLOCK_ENDS_NOISE = 2.0 - 2.0 * (1.0 + BLOCK_TIME_CONSTANTS) * _DECAY
+BLOCK_SPREAD = 2.0 / BLOCK_TIME_CONSTANTS**2 + 1.0 / 12.0
+SPECTRUM_POINTS = 32
+# The instrument is so many blocks older, and by the tyre's relaxation more.
+LEAST_LAG, RELAXATION_LAG = 2, 1.0
+# Noise below this part of the slip is none.
+QUIET_NOISE = 0.05
+CORRELATION_SHARE = 0.005
+# Noise is averaged over this time [s], and blocks count from when so much of it has passed.
+NOISE_MEMORY, NOISE_SETTLED = 0.5, 0.1
+# Blocks at fewer parts of the critical slip than this say little and make older ones forgotten more slowly.
+INFORMATIVE_SLIP = 0.3
+UNSTEADY_SLIP = 0.25
+# Degrees of freedom that the expected size of the residuals counts for, besides those of the residuals.
+PRIOR_BLOCKS = 5.0
+# Residuals beyond so many standard deviations count as that many; so much of each is allowed for, and so much must add up.
+LARGEST_RESIDUAL, ALLOWED_RESIDUAL, CHANGE_THRESHOLD = 4.0, 1.0, 16.0
+# From this sum on nothing more is learned until it is decided; blocks wait in the history, so long.
+SUSPENDED, LONGEST_SUSPENSION = 5.0, 10.0
+# Curves differ from the model by this part of the friction without being another ground.
+CHANGE_FLOOR = 0.05
+YOUNG_BLOCKS = 30.0
+# Forces against the slip by this many standard deviations, in this many blocks more than along it, have the wrong sign.
+WRONG_SIGN_DEVIATIONS, WRONG_SIGN_BLOCKS = 3.0, 8.0
+# Residuals of this many expected standard deviations say that the curve is another one.
+GREATEST_MISFIT = 4.0
+# A curve must fit better than a straight line by so much (twice the logarithm of the likelihood).
+BENT = 20.0
+
+# Layout of the parameters as the kernels take them.
+(
+    _CUT_OFF, _RELAXATION, _INERTIA, _LATERAL_MU, _LATERAL_LAMBDA, _SLIP_ACCURACY, _FRICTION_ACCURACY, _MEMORY, _LEAST_SPEED,
+    _LEAST_LOAD, _LEAST_SLIP, _SLIP_SPREAD, _FRICTION_SPREAD, _LEAST_BLOCKS,
+) = range(14)  # fmt: skip
+# Layout of the state: two stages of each filtered signal, then the rest.
+_ROLLING, _VELOCITY, _FORCE, _SLIP_Y, _FORCE_Y, _LOAD = range(0, 12, 2)
+_BEFORE, _NOISE = 12, 21  # two readings before of rolling speed, velocity and force; their variances
+_Z_X, _Z_Y, _TIME, _SINCE_BLOCK, _NOISE_TIME, _READINGS = range(24, 30)
+_WEIGHT, _BLOCKS, _CORRELATION, _LAST_RESIDUAL, _UP, _DOWN, _SUSPECT, _WRONG_SIGN = range(30, 38)
+_CHANGES, _CHANGE_TIME, _SLIP, _FRICTION, _SLIP_NOISE, _OPENED, _CUMULATED = range(38, 45)
+# Sums over the block so far: of rolling speed, velocity, force, force across, load, relaxed slip along and across; time, and
+# the rolling speed at its beginning.
+_MEAN, _BLOCK_TIME, _BEGAN_AT = 45, 52, 53
+_RESULT = 54  # mu_p, lambda_p, variances of their logarithms and covariance, valid, misfit, reason
+_HISTORY, _BLOCK = 16, 9  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
+# instrument, whether it has been added
+_STATE = 62
+_SUMS = 13
+# Columns of what `TerrainEstimator.run` returns.
+RESULTS = 14
+MU_P, LAMBDA_P, MU_VARIANCE, COVARIANCE, LAMBDA_VARIANCE, IS_VALID, MISFIT, REASON, CHANGES, SLIP = range(10)
+FRICTION, SLIP_NOISE, SINCE_CHANGE, SUSPECT = range(10, RESULTS)
+(
+    _ZZ, _ZA, _AA, _ZY, _ZG, _AY, _AG, _YY, _GY, _GG, _LOG, _BEYOND, _W,
+) = range(13)  # fmt: skip
+
+# Why an estimate is not valid, or 0.
+VALID, TOO_FEW, TOO_LITTLE_SLIP, TOO_WIDE, WRONG_SIGN, NO_FIT, AT_A_BOUND = range(7)
+REASONS = (
+    "valid", "too few readings at speed", "not enough slip to know", "not certain enough yet",
+    "forces act against the slip: a torque or a speed has the wrong sign", "the friction curve does not fit",
+    "at a bound of what is possible",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class TerrainParameters:
+    """How the ground is estimated.
+
+    Attributes:
+        contact: whose curve has the shape g, relaxation length and ratios of lateral to longitudinal; None: Kiencke's curve,
+            no relaxation, the same in all directions.
+        cut_off: of the filter on all signals [Hz].
+        inertia: I_rho / r^2, where forces are given as torque over radius (3.45) [kg]; 0 where they are forces.
+        slip_accuracy: error of the slip ratio that does not average out [1].
+        friction_accuracy: error of force over load that does not average out, relative [1].
+        memory: informative time after which readings are forgotten [s].
+        least_speed: below it a reading says nothing [m/s].
+        least_load: below this normal force a reading says nothing [N].
+        least_slip: part of the critical slip that must have been reached [1].
+        slip_spread, friction_spread: standard deviations of the logarithms up to which an estimate is valid [1].
+        least_blocks: blocks (50 a second) that an estimate takes at least.
+    """
+
+    contact: ContactDescription | None = None
+    cut_off: float = 20.0
+    inertia: float = 0.0
+    slip_accuracy: float = 0.0
+    friction_accuracy: float = 0.0
+    memory: float = 20.0
+    least_speed: float = 0.05
+    least_load: float = 1.0
+    least_slip: float = 0.6
+    slip_spread: float = 0.12
+    friction_spread: float = 0.06
+    least_blocks: int = 10
+
+    def __post_init__(self) -> None:
+        """Check the parameters.
+
+        Raises:
+            TerrainError: names the field, its value and what is allowed.
+        """
+        require("cut_off", self.cut_off, above=0.0, maximum=200.0)
+        for name in ("inertia", "least_load"):
+            require(name, getattr(self, name), minimum=0.0)
+        for name in ("slip_accuracy", "friction_accuracy"):
+            require(name, getattr(self, name), minimum=0.0, maximum=0.5)
+        require("memory", self.memory, above=0.0)
+        require("least_speed", self.least_speed, above=0.0)
+        require("least_slip", self.least_slip, minimum=0.5, maximum=1.0)
+        for name in ("slip_spread", "friction_spread"):
+            require(name, getattr(self, name), above=0.0, maximum=1.0)
+        require("least_blocks", self.least_blocks, minimum=5)
+
+    def numbers(self) -> FloatArray:
+        """Return the parameters as the kernels take them."""
+        contact = self.contact
+        relaxation, lateral_mu, lateral_lambda = 0.0, 1.0, 1.0
+        if contact is not None:
+            relaxation = contact.relaxation_length
+            lateral_mu, lateral_lambda = contact.mu_p / contact.lateral.mu_p, contact.lambda_p / contact.lateral.lambda_p
+        return np.array(
+            [
+                self.cut_off, relaxation, self.inertia, lateral_mu, lateral_lambda, self.slip_accuracy,
+                self.friction_accuracy, self.memory, self.least_speed, self.least_load, self.least_slip, self.slip_spread,
+                self.friction_spread, self.least_blocks,
+            ]
+        )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class WheelReading:
+    """What is known of one wheel at one time.
+
+    Attributes:
+        rolling_speed: r rho_dot [m/s].
+        velocity: of the wheel centre along its heading, over the ground [m/s].
+        force: of the ground on the wheel along its heading [N]; tau_rho / r where the parameters have an inertia.
+        normal_force: F_z [N].
+        lateral_slip: slip velocity across [m/s].
+        lateral_force: of the ground on the wheel across [N].
+    """
+
+    rolling_speed: float
+    velocity: float
+    force: float
+    normal_force: float
+    lateral_slip: float = 0.0
+    lateral_force: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class TerrainEstimate:
+    """What is known of the ground under one wheel.
+
+    Attributes:
+        mu_p: peak friction coefficient [1]; NaN where nothing is known at all.
+        lambda_p: critical slip ratio [1]; NaN likewise.
+        covariance: of (log mu_p, log lambda_p) (2, 2); inf likewise.
+        valid: whether the estimate is vouched for.
+        reason: why not; one of `REASONS`.
+        slip: current slip ratio, filtered and relaxed, positive along the force [1].
+        friction: current friction coefficient, filtered [1].
+        slip_noise: standard deviation of `slip` by noise [1].
+        misfit: size of the residuals over what the noise explains [1].
+        changes: how often the ground has changed so far.
+        since_change: time since the last change, as far as is known, or since the beginning [s].
+        suspect: whether what is felt now contradicts the estimate, but not for long enough to be sure.
+    """
+
+    mu_p: float
+    lambda_p: float
+    covariance: FloatArray
+    valid: bool
+    reason: str
+    slip: float
+    friction: float
+    slip_noise: float
+    misfit: float
+    changes: int
+    since_change: float
+    suspect: bool
+
+    def interval(self, deviations: float = 1.96) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the intervals of mu_p and of lambda_p; 95 % with the default."""
+        half = deviations * np.sqrt(np.diag(self.covariance))
+        return (
+            (self.mu_p * math.exp(-half[0]), self.mu_p * math.exp(half[0])),
+            (self.lambda_p * math.exp(-half[1]), self.lambda_p * math.exp(half[1])),
+        )
+
+
+@compiled
+def noise_gain(pole, dt):  # type: ignore[no-untyped-def]
+    """Return the variance that white noise of variance 1 has behind two equal poles p = exp(-pole dt), sampled every dt."""
+    p = math.exp(-pole * dt)
+    return (1.0 - p) * (1.0 + p * p) / (1.0 + p) ** 3
+
+
+@compiled
+def block_share(pole, rate, time):  # type: ignore[no-untyped-def]
+    """Return the part of `noise_gain` that is left behind one more pole `rate` [1/s] (inf: none) and in the mean over `time`.
+
+    The ratio of two integrals over the spectrum, with omega = pole tan(angle).
+    """
+    passed, all_of_it = 0.0, 0.0
+    for k in range(SPECTRUM_POINTS):
+        angle = (k + 0.5) * 0.5 * math.pi / SPECTRUM_POINTS
+        omega = pole * math.tan(angle)
+        density = math.cos(angle) ** 2  # 1 / (1 + tan^2)^2 d omega
+        half = 0.5 * omega * time
+        window = (math.sin(half) / half) ** 2
+        all_of_it += density
+        passed += density * window / (1.0 + (omega / rate) ** 2)
+    return passed / all_of_it
+
+
+@compiled
+def _smooth(state, index, value, share):  # type: ignore[no-untyped-def]
+    state[index] += share * (value - state[index])
+    state[index + 1] += share * (state[index] - state[index + 1])
+
+
+@compiled
+def _grid(j):  # type: ignore[no-untyped-def]
+    return LEAST_CRITICAL_SLIP * math.exp(j * math.log(GREATEST_CRITICAL_SLIP / LEAST_CRITICAL_SLIP) / (GRID - 1))
+
+
+@compiled
+def _add_block(  # type: ignore[no-untyped-def]
+    table, numbers, state, sums, lag, slip, slip_variance, friction, friction_variance, bending, averaged, spread
+):
+    """Add one block to the sums of every lambda_p; `lag` is the instrument's slip, `averaged` that around it."""
+    best = state[_RESULT + 1]
+    informative = 1.0
+    if best > 0.0:
+        informative = min(1.0, max(abs(lag), abs(slip)) / (INFORMATIVE_SLIP * best))
+    keep = math.exp(-informative * BLOCK_TIME_CONSTANTS / (POLE_PER_CUT_OFF * numbers[_CUT_OFF]) / numbers[_MEMORY])
+    state[_WEIGHT] = keep * state[_WEIGHT] + 1.0
+    state[_BLOCKS] += 1.0
+    for j in range(GRID):
+        critical = _grid(j)
+        x, x_lag = slip / critical, lag / critical
+        s2 = slip_variance / (critical * critical)
+        g, _, bend = shape_at(table, x)
+        corrected = g - 0.5 * bend * bending / (critical * critical)
+        z, slope, bend_lag = shape_at(table, x_lag)
+        a = -x_lag * slope
+        mu = 0.5
+        if sums[j, _ZG] > 0.0:
+            mu = min(max(sums[j, _ZY] / sums[j, _ZG], LEAST_FRICTION), GREATEST_FRICTION)
+        variance = friction_variance + mu * mu * s2 * (slope * slope + bend_lag * bend_lag * s2)
+        w = 1.0 / variance
+        for k in range(_SUMS):
+            sums[j, k] *= keep
+        sums[j, _ZZ] += w * z * z
+        sums[j, _ZA] += w * z * a
+        sums[j, _AA] += w * a * a
+        sums[j, _ZY] += w * z * friction
+        sums[j, _ZG] += w * z * corrected
+        sums[j, _AY] += w * a * friction
+        sums[j, _AG] += w * a * corrected
+        sums[j, _YY] += w * friction * friction
+        sums[j, _GY] += w * corrected * friction
+        sums[j, _GG] += w * corrected * corrected
+        sums[j, _LOG] += math.log(variance)
+        sums[j, _W] += 1.0
+        if abs(averaged) - 3.0 * spread >= numbers[_LEAST_SLIP] * critical:
+            sums[j, _BEYOND] += 1.0
+
+
+@compiled
+def _equation(sums, j):  # type: ignore[no-untyped-def]
+    """Return mu_p and the second equation's left side at a lambda_p of the grid."""
+    mu = sums[j, _ZY] / max(sums[j, _ZG], 1e-300)
+    return mu, sums[j, _AY] - mu * sums[j, _AG]
+
+
+@compiled
+def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
+    """Write the result into the state."""
+    result = state[_RESULT : _RESULT + 8]
+    result[:] = 0.0
+    result[7] = TOO_FEW
+    if state[_BLOCKS] < numbers[_LEAST_BLOCKS]:
+        return
+    best, least, straight = -1, math.inf, math.inf
+    for j in range(GRID):
+        if sums[j, _ZG] <= 0.0:
+            continue
+        mu, _ = _equation(sums, j)
+        if mu <= 0.0:
+            continue
+        cost = sums[j, _LOG] + sums[j, _YY] - 2.0 * mu * sums[j, _GY] + mu * mu * sums[j, _GG]
+        if cost < least:
+            best, least = j, cost
+        straight = cost
+    if best < 0:
+        result[7] = WRONG_SIGN if state[_WRONG_SIGN] >= WRONG_SIGN_BLOCKS else TOO_LITTLE_SLIP
+        return
+    # The root of the second equation next to the least error: between two points of the grid where its sign changes.
+    left = -1
+    for distance in range(GRID):
+        for j in (best - 1 - distance, best + distance):
+            if 0 <= j < GRID - 1 and left < 0 and sums[j, _ZG] > 0.0 and sums[j + 1, _ZG] > 0.0:
+                _, h0 = _equation(sums, j)
+                _, h1 = _equation(sums, j + 1)
+                if (h0 > 0.0) != (h1 > 0.0):
+                    left = j
+        if left >= 0:
+            break
+    if left < 0:
+        mu, _ = _equation(sums, best)
+        result[0], result[1], result[2], result[4] = mu, _grid(best), 1.0, 1.0
+        result[7] = TOO_LITTLE_SLIP if best >= GRID // 2 else AT_A_BOUND
+        return
+    mu0, h0 = _equation(sums, left)
+    mu1, h1 = _equation(sums, left + 1)
+    part = h0 / (h0 - h1)
+    step = math.log(_grid(left + 1) / _grid(left))
+    j = left + 1 if part > 0.5 else left
+    critical = _grid(left) * math.exp(part * step)
+    mu = max(mu0, 1e-6) ** (1.0 - part) * max(mu1, 1e-6) ** part
+    slope = (h1 - h0) / step
+    follows = math.log(max(mu1, 1e-6) / max(mu0, 1e-6)) / step
+    count = state[_WEIGHT]
+    squares = sums[j, _YY] - 2.0 * mu * sums[j, _GY] + mu * mu * sums[j, _GG]
+    scale = (PRIOR_BLOCKS + max(squares, 0.0)) / (PRIOR_BLOCKS + max(count - 2.0, 0.0))
+    correlation = min(max(state[_CORRELATION], -0.3), 0.8)
+    # Of a moving average, or of a memory that fades.
+    inflated = scale * (1.0 + 2.0 * correlation if correlation < 0.0 else (1.0 + correlation) / (1.0 - correlation))
+    share = sums[j, _AG] / sums[j, _ZG]
+    h_variance = max(sums[j, _AA] - 2.0 * share * sums[j, _ZA] + share * share * sums[j, _ZZ], 1e-300)
+    slip_variance = inflated * h_variance / (slope * slope)
+    own = inflated * sums[j, _ZZ] / (sums[j, _ZG] * mu) ** 2
+    together = inflated * (sums[j, _ZA] - share * sums[j, _ZZ]) / (sums[j, _ZG] * mu)
+    mu_variance = own + follows * follows * slip_variance - 2.0 * follows / slope * together
+    covariance = follows * slip_variance - together / slope
+    systematic = (numbers[_SLIP_ACCURACY] / critical) ** 2
+    slip_variance += systematic
+    mu_variance = max(mu_variance, own) + numbers[_FRICTION_ACCURACY] ** 2
+    limit = 0.999 * math.sqrt(slip_variance * mu_variance)
+    result[0], result[1], result[2], result[4] = mu, critical, mu_variance, slip_variance
+    result[3] = min(max(covariance, -limit), limit)
+    result[6] = math.sqrt(scale)
+    upper = critical * math.exp(3.0 * min(math.sqrt(slip_variance), 3.0))
+    where = math.ceil(math.log(upper / LEAST_CRITICAL_SLIP) / step)
+    if state[_WRONG_SIGN] >= WRONG_SIGN_BLOCKS:
+        result[7] = WRONG_SIGN
+    elif where >= GRID or sums[where, _BEYOND] < 3.0 or straight - least < BENT * scale:
+        result[7] = TOO_LITTLE_SLIP
+    elif not (LEAST_FRICTION < mu < GREATEST_FRICTION):
+        result[7] = AT_A_BOUND
+    elif math.sqrt(slip_variance) > numbers[_SLIP_SPREAD] or math.sqrt(mu_variance) > numbers[_FRICTION_SPREAD]:
+        result[7] = TOO_WIDE
+    elif result[6] > GREATEST_MISFIT:
+        result[7] = NO_FIT
+    else:
+        result[5], result[7] = 1.0, VALID
+
+
+@compiled
+def _forget(state, sums):  # type: ignore[no-untyped-def]
+    sums[:] = 0.0
+    for index in (_WEIGHT, _BLOCKS, _CORRELATION, _LAST_RESIDUAL, _UP, _DOWN, _SUSPECT, _WRONG_SIGN):
+        state[index] = 0.0
+    state[_RESULT : _RESULT + 8] = 0.0
+    state[_RESULT + 7] = TOO_FEW
+
+
+@compiled
+def _take(table, numbers, state, sums, history, last, begin):  # type: ignore[no-untyped-def]
+    """Add the blocks whose instrument is complete with block `last` of the history, not looking at blocks before `begin`."""
+    for index in range(begin, last - LEAST_LAG + 1):
+        lag = max(int(history[index, 7]), LEAST_LAG)
+        if history[index, 5] < 1.0 or history[index, 8] > 0.0 or index + lag > last or index - lag < begin:
+            continue
+        whole = True
+        for k in range(index - lag, index + lag + 1):
+            whole = whole and history[k, 5] > 0.0
+        if not whole:
+            continue
+        now = history[index]
+        now[8] = 1.0
+        averaged, spread = 0.0, 0.0
+        for k in range(index - LEAST_LAG, index + LEAST_LAG + 1):
+            averaged += history[k, 0] / (2 * LEAST_LAG + 1)
+            spread += history[k, 1]
+        # Neighbours are correlated by filter and tyre, which widens their mean by a half.
+        spread = 1.5 * math.sqrt(spread) / (2 * LEAST_LAG + 1)
+        instrument = 0.5 * (history[index - lag, 0] + history[index + lag, 0])
+        _add_block(table, numbers, state, sums, instrument, now[0], now[1], now[2], now[3], now[6], averaged, spread)
+
+
+@compiled
+def _watch(table, numbers, state, history):  # type: ignore[no-untyped-def]
+    """Compare the newest block with the estimate; returns whether the ground has changed."""
+    now = history[_HISTORY - 1]
+    mu, critical = state[_RESULT], state[_RESULT + 1]
+    if now[5] < 1.0 or mu <= 0.0 or critical <= 0.0:
+        return False
+    x, s2 = now[0] / critical, now[1] / critical**2
+    g, slope, bend = shape_at(table, x)
+    residual = now[2] - mu * (g - 0.5 * bend * now[6] / critical**2)
+    lag = history[_HISTORY - 1 - max(int(now[7]), LEAST_LAG)]
+    _, slope_lag, bend_lag = shape_at(table, lag[0] / critical if lag[5] > 0.0 else x)
+    steep = max(slope * slope, slope_lag * slope_lag)
+    bent = max(bend * bend, bend_lag * bend_lag)
+    scale = max(state[_RESULT + 6], 1.0) ** 2
+    variance = scale * (now[3] + mu * mu * (steep * s2 + 0.5 * bent * s2 * s2))
+    expected = residual / math.sqrt(variance)
+    # How far residuals of neighbouring blocks go together, in units of their variance.
+    share = max(CORRELATION_SHARE, 1.0 / state[_BLOCKS])
+    state[_CORRELATION] += share * (min(max(expected * state[_LAST_RESIDUAL], -4.0), 4.0) - state[_CORRELATION])
+    state[_LAST_RESIDUAL] = min(max(expected, -3.0), 3.0)
+    if state[_RESULT + 5] == 0.0:
+        return False
+    variance += (mu * slope * numbers[_SLIP_ACCURACY] / critical) ** 2 + (CHANGE_FLOOR * now[2]) ** 2
+    # Of few blocks the spread is not known well either.
+    young = 1.0 + YOUNG_BLOCKS / max(state[_WEIGHT], 1.0)
+    variance += young * mu * mu * (g * g * state[_RESULT + 2] + slope * slope * x * x * state[_RESULT + 4])
+    t = math.copysign(1.0, now[2]) * residual / math.sqrt(variance)
+    t = min(max(t, -LARGEST_RESIDUAL), LARGEST_RESIDUAL)
+    state[_UP] = max(0.0, state[_UP] + t - ALLOWED_RESIDUAL)
+    state[_DOWN] = max(0.0, state[_DOWN] - t - ALLOWED_RESIDUAL)
+    suspect = state[_UP] > 0.0 or state[_DOWN] > 0.0
+    state[_SUSPECT] = state[_SUSPECT] + 1.0 if suspect else 0.0
+    return max(state[_UP], state[_DOWN]) > CHANGE_THRESHOLD
+
+
+@compiled
+def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-untyped-def]
+    """Close a block: sample the filtered signals, watch for a change, add it, solve."""
+    mean = state[_MEAN : _MEAN + 7] / state[_BLOCK_TIME]
+    rolling, velocity = mean[0], mean[1]
+    force_x = mean[2] - numbers[_INERTIA] * (state[_ROLLING + 1] - state[_BEGAN_AT]) / state[_BLOCK_TIME]
+    force_y, load = mean[3] * numbers[_LATERAL_MU], mean[4]
+    speed = max(abs(rolling), abs(velocity))
+    for k in range(_HISTORY - 1):
+        history[k] = history[k + 1]
+    now = history[_HISTORY - 1]
+    now[:] = 0.0
+    force = math.hypot(force_x, force_y)
+    full_gain = noise_gain(pole, dt)
+    gain = full_gain * block_share(pole, math.inf, state[_BLOCK_TIME])
+    settled, slip_now = state[_NOISE_TIME] > NOISE_SETTLED, mean[5]
+    usable = settled and abs(slip_now) <= 1.0 and speed > numbers[_LEAST_SPEED] and load > numbers[_LEAST_LOAD] and force > 0.0
+    if not usable:
+        state[_SLIP], state[_FRICTION], state[_SLIP_NOISE] = 0.0, 0.0, 0.0
+        return
+    slip_y = mean[6] * numbers[_LATERAL_LAMBDA]
+    # Along the force, forwards or backwards: the size alone would turn noise into friction.
+    sign = 1.0 if force_x >= 0.0 else -1.0
+    slip = sign * (mean[5] * force_x + slip_y * force_y) / force
+    along = force_x / force
+    # Of lambda = 1 - v / (r rho_dot), and of its mirror in braking.
+    other = min(abs(rolling), abs(velocity)) / speed
+    larger, smaller = state[_NOISE], state[_NOISE + 1]
+    if abs(velocity) > abs(rolling):
+        larger, smaller = smaller, larger
+    slip_gain, relaxed_blocks = gain, 0
+    if numbers[_RELAXATION] > 0.0:
+        slip_gain = full_gain * block_share(pole, speed / numbers[_RELAXATION], state[_BLOCK_TIME])
+        relaxed_blocks = math.ceil(RELAXATION_LAG * numbers[_RELAXATION] / speed * pole / BLOCK_TIME_CONSTANTS)
+    slip_variance = slip_gain * (other * other * larger + smaller) / (speed * speed) * along * along
+    slip_variance += 1e-10
+    friction = sign * force / load
+    per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
+    ends = full_gain * BLOCK_ENDS_NOISE * per_time * per_time * state[_NOISE]
+    friction_variance = (gain * state[_NOISE + 2] + ends) / (load * load)
+    accuracy = max(numbers[_FRICTION_ACCURACY], 0.002) * friction
+    friction_variance += accuracy * accuracy + 1e-10
+    now[0], now[1], now[2], now[3], now[4], now[5] = slip, slip_variance, friction, friction_variance, state[_TIME], 1.0
+    # Only where there is noise does the instrument have to be free of it; nearer in time it is the better one.
+    noisy = slip_variance > (QUIET_NOISE * slip) ** 2
+    now[7] = min(LEAST_LAG + relaxed_blocks if noisy else LEAST_LAG, (_HISTORY - 1) // 2)
+    # What does not average out spreads the residuals as well.
+    now[1] += numbers[_SLIP_ACCURACY] ** 2
+    # The mean of a curve is bent by noise, and the mean friction by slip that moves within the filter's memory, 2 / pole^2.
+    now[6] = slip_variance
+    if history[_HISTORY - 2, 5] > 0.0:
+        moved = (slip - history[_HISTORY - 2, 0]) ** 2 - slip_variance - history[_HISTORY - 2, 1]
+        now[6] -= BLOCK_SPREAD * moved
+        # Where it moves by half of itself between two blocks this is no longer the first term of a series.
+        steady = UNSTEADY_SLIP * max(abs(slip), abs(history[_HISTORY - 2, 0])) + 4.0 * math.sqrt(slip_variance)
+        if abs(slip - history[_HISTORY - 2, 0]) > steady:
+            now[5] = 0.5
+    state[_SLIP], state[_FRICTION], state[_SLIP_NOISE] = sign * slip, abs(friction), math.sqrt(slip_variance)
+    enough = WRONG_SIGN_DEVIATIONS * math.sqrt(slip_variance) + numbers[_SLIP_ACCURACY]
+    if abs(friction) > 0.01 + WRONG_SIGN_DEVIATIONS * math.sqrt(friction_variance) and abs(slip) > enough:
+        vote = 1.0 if slip * friction < 0.0 else -1.0
+        state[_WRONG_SIGN] = min(max(state[_WRONG_SIGN] + vote, 0.0), 2.0 * WRONG_SIGN_BLOCKS)
+    if _watch(table, numbers, state, history):
+        replayed = min(int(state[_SUSPECT]), _HISTORY - LEAST_LAG)
+        changes, opened = state[_CHANGES] + 1.0, history[_HISTORY - max(replayed, 1), 4]
+        _forget(state, sums)
+        state[_CHANGES], state[_CHANGE_TIME], state[_OPENED] = changes, opened, 0.0
+        begin = _HISTORY - max(replayed, 1)
+        history[:begin, 5] = 0.0
+        history[begin:, 8] = 0.0
+        _take(table, numbers, state, sums, history, _HISTORY - 1, begin)
+    elif max(state[_UP], state[_DOWN]) > SUSPENDED and state[_SUSPECT] <= LONGEST_SUSPENSION:
+        return
+    else:
+        _take(table, numbers, state, sums, history, _HISTORY - 1, 0)
+    _solve(numbers, state, sums)
+
+
+@compiled
+def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[no-untyped-def]
+    """Take one reading (6,) in place: rolling speed, velocity, force, normal force, lateral slip, lateral force."""
+    pole = POLE_PER_CUT_OFF * numbers[_CUT_OFF]
+    share = 1.0 - math.exp(-pole * dt)
+    first = state[_READINGS] == 0.0
+    began_at = state[_ROLLING + 1] if not first else reading[0]
+    values = (
+        (_ROLLING, reading[0]), (_VELOCITY, reading[1]), (_FORCE, reading[2]), (_LOAD, reading[3]), (_SLIP_Y, reading[4]),
+        (_FORCE_Y, reading[5]),
+    )  # fmt: skip
+    for index, value in values:
+        if first:
+            state[index], state[index + 1] = value, value
+        else:
+            _smooth(state, index, value, share)
+    forgotten = 1.0 - math.exp(-dt / NOISE_MEMORY)
+    for k in range(3):
+        before, latest = state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1]
+        if state[_READINGS] >= 2.0:
+            # The second difference of white noise has six times its variance; a smooth signal has next to none.
+            square = (reading[k] - 2.0 * latest + before) ** 2 / 6.0
+            state[_NOISE + k] += max(forgotten, 1.0 / (state[_READINGS] - 1.0)) * (square - state[_NOISE + k])
+        state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1] = latest, reading[k]
+    state[_READINGS] += 1.0
+    state[_TIME] += dt
+    state[_NOISE_TIME] += dt
+    speed = max(abs(state[_ROLLING + 1]), abs(state[_VELOCITY + 1]), 1e-3)
+    slip_x, slip_y = state[_ROLLING + 1] - state[_VELOCITY + 1], state[_SLIP_Y + 1]
+    if numbers[_RELAXATION] > 0.0:
+        relaxed = 1.0 - math.exp(-dt * speed / numbers[_RELAXATION])
+        state[_Z_X] += relaxed * (slip_x / speed - state[_Z_X])
+        state[_Z_Y] += relaxed * (slip_y / speed - state[_Z_Y])
+        # The tyre's damping leads the force; see `contact_model`.
+        lead = DAMPING_TIME * speed / numbers[_RELAXATION]
+        lead_x, lead_y = lead * (slip_x / speed - state[_Z_X]), lead * (slip_y / speed - state[_Z_Y])
+    else:
+        lead_x, lead_y = 0.0, 0.0
+        state[_Z_X], state[_Z_Y] = slip_x / speed, slip_y / speed
+    state[_SINCE_BLOCK] += dt
+    if state[_BLOCK_TIME] == 0.0:
+        state[_BEGAN_AT] = began_at
+    means = (
+        state[_ROLLING + 1], state[_VELOCITY + 1], state[_FORCE + 1], state[_FORCE_Y + 1], state[_LOAD + 1],
+        state[_Z_X] + lead_x, state[_Z_Y] + lead_y,
+    )  # fmt: skip
+    for k in range(7):
+        state[_MEAN + k] += dt * means[k]
+    state[_BLOCK_TIME] += dt
+    period = BLOCK_TIME_CONSTANTS / pole
+    if state[_SINCE_BLOCK] >= period:
+        state[_SINCE_BLOCK] = min(state[_SINCE_BLOCK] - period, period)
+        _block(table, numbers, state, sums, history, pole, dt)
+        state[_MEAN : _BLOCK_TIME + 1] = 0.0
+
+
+@compiled
+def run_wheels(tables, numbers, state, sums, history, readings, dt, every, results):  # type: ignore[no-untyped-def]
+    """Take readings (T, n, 6) of n wheels in place, and note results (T / every, n, RESULTS).
+
+    Numbers of all wheels are stacked. It is the one way into compiled code, as compiling it takes long.
+    """
+    for k in range(len(readings)):
+        for i in range(readings.shape[1]):
+            advance(tables[i], numbers[i], state[i], sums[i], history[i], readings[k, i], dt)
+            if k % every == 0:
+                row = results[k // every, i]
+                row[:8] = state[i, _RESULT : _RESULT + 8]
+                row[8], row[9], row[10], row[11] = (
+                    state[i, _CHANGES],
+                    state[i, _SLIP],
+                    state[i, _FRICTION],
+                    state[i, _SLIP_NOISE],
+                )
+                row[12], row[13] = state[i, _TIME] - state[i, _CHANGE_TIME], state[i, _SUSPECT]
+
+
+@dataclasses.dataclass(frozen=True)
+class TerrainState:
+    """State of the estimator of n wheels; what its numbers are is the estimator's own matter."""
+
+    numbers: FloatArray
+    sums: FloatArray
+    history: FloatArray
+
+
+def initial_state(n: int = 1) -> TerrainState:
+    """Return the state of n wheels before the first reading."""
+    numbers = np.zeros((n, _STATE))
+    numbers[:, _RESULT + 7] = TOO_FEW
+    return TerrainState(numbers, np.zeros((n, GRID, _SUMS)), np.zeros((n, _HISTORY, _BLOCK)))
+
+
+def estimate_of(row: FloatArray) -> TerrainEstimate:
+    """Return what one row of results (RESULTS,) says."""
+    known = row[MU_P] > 0.0
+    covariance = np.array([[row[MU_VARIANCE], row[COVARIANCE]], [row[COVARIANCE], row[LAMBDA_VARIANCE]]])
+    return TerrainEstimate(
+        mu_p=float(row[MU_P]) if known else math.nan,
+        lambda_p=float(row[LAMBDA_P]) if known else math.nan,
+        covariance=covariance if known else np.full((2, 2), np.inf),
+        valid=bool(row[IS_VALID] > 0.0),
+        reason=REASONS[int(row[REASON])],
+        slip=float(row[SLIP]),
+        friction=float(row[FRICTION]),
+        slip_noise=float(row[SLIP_NOISE]),
+        misfit=float(row[MISFIT]),
+        changes=int(row[CHANGES]),
+        since_change=float(row[SINCE_CHANGE]),
+        suspect=bool(row[SUSPECT] > 0.0),
+    )
+
+
+class TerrainEstimator:
+    """The estimator of one wheel; see the module's docstring.
+
+    Args:
+        parameters: how the ground is estimated.
+    """
+
+    def __init__(self, parameters: TerrainParameters | None = None) -> None:
+        self.parameters = parameters or TerrainParameters()
+        self._tables = shape_table(self.parameters.contact)[None]
+        self._numbers = self.parameters.numbers()[None]
+
+    def initial_state(self) -> TerrainState:
+        """Return the state before the first reading."""
+        return initial_state()
+
+    def step(self, state: TerrainState, reading: WheelReading, dt: float) -> tuple[TerrainState, TerrainEstimate]:
+        """Take one reading.
+
+        Args:
+            state: after the reading before; it is not changed.
+            reading: what is known of the wheel now.
+            dt: measured time since the reading before [s]; of the first one any.
+
+        Returns:
+            New state and estimate.
+
+        Raises:
+            TerrainError: a reading that is not finite, or dt is not positive; the caller keeps its state.
+        """
+        require_dt(dt)
+        values = np.array(
+            [[[
+                reading.rolling_speed, reading.velocity, reading.force, reading.normal_force, reading.lateral_slip,
+                reading.lateral_force,
+            ]]]
+        )  # fmt: skip
+        if not np.isfinite(values).all():
+            raise TerrainError(f"{reading!r} is not allowed; allowed: finite numbers")
+        state = TerrainState(state.numbers.copy(), state.sums.copy(), state.history.copy())
+        results = np.empty((1, 1, RESULTS))
+        run_wheels(self._tables, self._numbers, state.numbers, state.sums, state.history, values, dt, 1, results)
+        return state, estimate_of(results[0, 0])
+
+    def run(self, readings: FloatArray, dt: float, every: int = 1) -> FloatArray:
+        """Take a whole record (T, 6) of readings at a constant step, compiled.
+
+        Returns:
+            (T / every, RESULTS): mu_p, lambda_p, covariance of their logarithms (mu mu, mu lambda, lambda lambda), valid,
+            misfit, index of the reason, number of changes, slip, friction, deviation of the slip, time since the last
+            change, suspect. Zeros where nothing is known.
+        """
+        require_dt(dt)
+        if readings.ndim != 2 or readings.shape[1] != 6 or not np.isfinite(readings).all():
+            raise TerrainError(f"readings of shape {readings.shape} are not allowed; allowed: finite numbers, shape (T, 6)")
+        results = np.zeros((-(-len(readings) // every), 1, RESULTS))
+        state = self.initial_state()
+        run_wheels(
+            self._tables, self._numbers, state.numbers, state.sums, state.history, readings[:, None, :].copy(), dt, every,
+            results,
+        )  # fmt: skip
+        return results[:, 0]

@@ -1,0 +1,268 @@
+"""The estimators of a whole robot, the slips that count, and the increments that make a wheel slip."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcw_description import load_robot
+from pcw_description.differential_kinematics import joint_matrix, wheel_jacobian
+from pcw_description.robot_description import DRIVE, STEER
+from pcw_terrain import (
+    ActiveIdentification,
+    ActiveMeasurement,
+    ActiveParameters,
+    Phase,
+    Refusal,
+    RobotReading,
+    RobotTerrain,
+    TerrainError,
+)
+from pcw_terrain.believed_slip import independent_slip
+
+THESIS = load_robot("thesis")
+NAMES = ("thesis", "tidybot2", "xr4000", "dyros_pcv", "flow_base")
+
+
+def friction(slip, mu_p, lambda_p):
+    return 2.0 * mu_p * lambda_p * slip / (lambda_p**2 + slip**2)
+
+
+def drive(terrain, grounds, seconds=6.0, direction=(1.0, 0.0)):
+    """Step a robot whose casters all slip to and fro, each on its own ground (mu_p, lambda_p), without noise."""
+    n, dt, state = terrain.n, 0.002, terrain.initial_state()
+    along = np.array(direction)
+    for k in range(round(seconds / dt)):
+        slip = np.array([lambda_p for _, lambda_p in grounds]) * (1.0 - math.cos(4.0 * k * dt)) * 0.8
+        force = np.zeros((n, 2))
+        for _ in range(3):  # loads and forces depend on each other
+            loads = terrain.normal_force(np.zeros(n), force)
+            force = np.array([friction(s, *g) for s, g in zip(slip, grounds, strict=True)])[:, None] * loads[:, None] * along
+        velocity = 0.8
+        rolling = velocity / (1.0 - slip * along[0])
+        sensed = np.column_stack([rolling, np.zeros(n)])
+        slips = np.column_stack([rolling - velocity, slip * along[1] * rolling])
+        state, estimate = terrain.step(state, RobotReading(sensed, slips, force, np.zeros(n)), dt)
+    return state, estimate
+
+
+def rigid(robot):
+    """Return the robot with tyres that do not relax, as the readings above do not."""
+    contact = dataclasses.replace(robot.contact, relaxation_length=1e-6)
+    return dataclasses.replace(robot, contact=contact)
+
+
+def test_every_caster_finds_its_own_ground():
+    grounds = [(0.8, 0.1), (0.3, 0.06), (0.8, 0.1), (0.5, 0.2)]
+    _, found = drive(RobotTerrain(rigid(THESIS)), grounds)
+    assert found.valid.all() and not found.uniform and found.felt_now.dtype == bool
+    np.testing.assert_allclose(found.mu_p, [mu for mu, _ in grounds], rtol=0.01)
+    np.testing.assert_allclose(found.lambda_p, [slip for _, slip in grounds], rtol=0.02)
+
+
+def test_on_one_ground_the_robot_knows_it_better_than_a_caster():
+    _, found = drive(RobotTerrain(rigid(THESIS)), 4 * [(0.6, 0.12)])
+    assert found.uniform
+    np.testing.assert_allclose(found.robot, [0.6, 0.12], rtol=0.01)
+    assert found.robot_covariance[0, 0] < 0.3 * found.covariance[:, 0, 0].max()
+
+
+def test_slip_across_is_slip_too():
+    """Along and across in one ellipse: at 45 degrees the same ground is found."""
+    _, found = drive(RobotTerrain(rigid(THESIS)), 4 * [(0.6, 0.12)], direction=(math.sqrt(0.5), math.sqrt(0.5)))
+    np.testing.assert_allclose(found.robot, [0.6, 0.12], rtol=0.03)
+
+
+def test_a_caster_whose_slip_is_not_known_by_itself_says_nothing():
+    terrain = RobotTerrain(THESIS)
+    state, steady = terrain.initial_state(), np.zeros(4)
+    reading = RobotReading(
+        np.full((4, 2), 0.5), np.full((4, 2), 0.05), np.full((4, 2), 50.0), steady, np.array([1, 0, 0, 0], bool)
+    )
+    for _ in range(500):
+        state, found = terrain.step(state, reading, 0.002)
+    assert np.isfinite(found.mu_p[1:]).sum() == 0 and found.slip[0] > 0.0 and (found.slip[1:] == 0.0).all()
+
+
+def test_loads_carry_the_weight_and_follow_the_push():
+    terrain = RobotTerrain(THESIS)
+    still = terrain.normal_force(np.zeros(4), np.zeros((4, 2)))
+    pushed = terrain.normal_force(np.zeros(4), np.tile([50.0, 0.0], (4, 1)))
+    assert still.sum() == pytest.approx(THESIS.total_mass * 9.81) and pushed.sum() == pytest.approx(still.sum())
+    assert (pushed[:2] < still[:2]).all() and (pushed[2:] > still[2:]).all()  # forwards: the rear carries more
+
+
+def test_a_robot_reading_that_is_not_finite_or_of_a_wrong_shape_is_refused():
+    terrain, good = RobotTerrain(THESIS), np.zeros((4, 2))
+    state = terrain.initial_state()
+    for bad in (np.zeros((3, 2)), np.full((4, 2), np.nan)):
+        with pytest.raises(TerrainError, match="force"):
+            terrain.step(state, RobotReading(good, good, bad, np.zeros(4)), 0.002)
+        with pytest.raises(TerrainError, match="effort"):
+            terrain.step_with_twist(state, good, good, bad, np.zeros(3), 0.002)
+    with pytest.raises(TerrainError, match="dt"):
+        terrain.step(state, RobotReading(good, good, good, np.zeros(4)), 0.0)
+
+
+def test_slip_that_an_observer_takes_from_the_force_itself_is_no_evidence():
+    """Below its believed peak a wheel's slip is the believed root; past it, or near the peak, it is known otherwise."""
+    loads, force, slip = np.full(4, 200.0), np.zeros((4, 2)), np.zeros((4, 2))
+    sensed = np.full((4, 2), [1.0, 0.0])
+    force[:, 0] = [80.0, 80.0, 150.0, 80.0]
+    slip[:, 0] = [0.027, 0.4, 0.08, 0.12]
+    np.testing.assert_array_equal(independent_slip(THESIS, sensed, slip, force, loads), [False, True, True, True])
+    assert not independent_slip(THESIS, sensed, slip, force, np.zeros(4)).any()
+
+
+# --- Slip on purpose --------------------------------------------------------------------------------------
+
+
+def steady(robot, speed=0.3, heading=0.0, **changes):
+    """Return what is measured of a robot that rolls along without slip or force."""
+    steer = np.full(robot.n, heading)
+    position, velocity = np.zeros((robot.n, 2)), np.zeros((robot.n, 2))
+    position[:, STEER] = steer
+    velocity[:, DRIVE] = speed / robot.wheel_radius
+    velocity = np.einsum("nij,nj->ni", _rolling(robot), np.column_stack([np.full(robot.n, speed), np.zeros(robot.n)]))
+    values = {
+        "position": position, "velocity": velocity, "force": np.zeros((robot.n, 2)),
+        "controller_torque": np.zeros((robot.n, 2)), "normal_force": np.full(robot.n, robot.total_mass * 9.81 / robot.n),
+        "known": np.zeros(robot.n, bool), "mu_p": np.full(robot.n, 0.3), "lambda_p": np.full(robot.n, 0.1),
+    }  # fmt: skip
+    return ActiveMeasurement(**(values | changes))
+
+
+def _rolling(robot):
+    B = joint_matrix(robot)
+    return np.stack([np.linalg.inv(B[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]) for i in range(robot.n)])
+
+
+def slipping(active, measurement):
+    """Return state and output some cycles after a wheel was let go."""
+    state = active.request(active.initial_state())
+    for _ in range(200):
+        state, output = active.step(state, measurement, 0.002)
+        if state.phase is Phase.SLIP and state.elapsed > 0.1:
+            break
+    assert state.phase is Phase.SLIP
+    return state, output
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("heading", [0.0, 0.9])
+def test_the_increment_is_internal(name, heading):
+    """A^T dF = 0 to rounding, and the torques are those of dF: nothing of it moves the robot."""
+    robot = load_robot(name)
+    force = np.zeros((robot.n, 2))
+    force[0] = 20.0, 3.0
+    measured = steady(robot, heading=heading, force=force, mu_p=np.full(robot.n, 0.06))
+    active = ActiveIdentification(robot)
+    _, output = slipping(active, measured)
+    assert output.testing == 0 and np.abs(output.net_wrench).max() < 1e-9
+    others = np.einsum("nij,nj->ni", np.transpose(_rolling(robot), (0, 2, 1)), output.torque)[1:]
+    A = wheel_jacobian(robot, np.full(robot.n, heading))
+    np.testing.assert_allclose(A[2:].T @ others.ravel(), -A[0] * 20.0, atol=1e-9)
+
+
+def test_the_controller_sees_wheels_that_roll():
+    measured = steady(THESIS)
+    fast = measured.velocity.copy()
+    fast[0, DRIVE] += 1.0
+    _, output = slipping(ActiveIdentification(THESIS), dataclasses.replace(measured, velocity=fast))
+    np.testing.assert_allclose(output.controller_velocity, measured.velocity, atol=1e-9)
+    np.testing.assert_allclose(output.twist, [0.3, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "refusal"),
+    [
+        ({"speed": 0.02}, Refusal.TOO_SLOW),
+        ({"speed": 2.0}, Refusal.TOO_FAST),
+        ({"mu_p": np.full(4, 1.5)}, Refusal.TORQUE),
+        ({"mu_p": np.array([0.5, 0.1, 0.5, 0.5])}, Refusal.OTHERS_NEAR_LIMIT),
+        ({"turning": True}, Refusal.TURNING),
+    ],
+)
+def test_it_does_not_begin_where_it_is_not_safe(changes, refusal):
+    turning = changes.pop("turning", False) if isinstance(changes, dict) else False
+    measured = steady(THESIS, **changes)
+    if turning:
+        velocity = measured.velocity.copy()
+        velocity[2, STEER] = 3.0
+        measured = dataclasses.replace(measured, velocity=velocity)
+        changes["turning"] = True
+    active = ActiveIdentification(THESIS)
+    state = active.request(active.initial_state())
+    for _ in range(100):
+        state, output = active.step(state, measured, 0.002)
+        assert not output.torque.any()
+    assert state.phase is Phase.REFUSED and state.refusal is refusal
+
+
+def test_it_ends_at_once_when_another_wheel_slips_when_cancelled_and_when_it_takes_too_long():
+    active, measured = ActiveIdentification(THESIS), steady(THESIS)
+    velocity = measured.velocity.copy()
+    velocity[3, DRIVE] += 2.5
+    ends = {}
+    for name, change in (
+        (Refusal.OTHERS_SLIP, lambda state: (state, dataclasses.replace(measured, velocity=velocity))),
+        (Refusal.CANCELLED, lambda state: (active.cancel(state), measured)),
+    ):
+        state, _ = slipping(active, measured)
+        for _ in range(300):
+            state, current = change(state)
+            state, output = active.step(state, current, 0.002)
+        ends[name] = state.refusal
+        assert state.phase is Phase.REFUSED and not output.torque.any()
+    assert all(name is refusal for name, refusal in ends.items())
+    slow = ActiveIdentification(THESIS, ActiveParameters(growth=0.1, longest=0.3))
+    state = slow.request(slow.initial_state())
+    for _ in range(600):
+        state, _ = slow.step(state, measured, 0.002)
+    assert state.refusal is Refusal.TOO_LONG
+
+
+def test_all_casters_are_done_once_each_and_the_robot_is_left_alone_then():
+    active, measured = ActiveIdentification(THESIS), steady(THESIS)
+    state, tested = active.request(active.initial_state()), []
+    for _ in range(4000):
+        state, output = active.step(state, measured, 0.002)
+        if output.testing >= 0 and (not tested or tested[-1] != output.testing):
+            tested.append(output.testing)
+    assert tested == [0, 1, 2, 3] and state.phase is Phase.DONE and not output.torque.any()
+
+
+def test_a_prediction_grows_with_the_force_and_shrinks_with_the_stiffness():
+    loads = np.full(4, 220.0)
+    soft, stiff = (ActiveIdentification(THESIS, ActiveParameters(stiffness=k)) for k in (100.0, 400.0))
+    small, large = (soft.predict(np.zeros(4), 0, loads, mu) for mu in (0.2, 0.8))
+    assert 0.0 < small.path < large.path < 0.02 and large.force == pytest.approx(176.0)
+    assert stiff.predict(np.zeros(4), 0, loads, 0.8).path == pytest.approx(large.path / 4.0)
+    assert large.others_use == pytest.approx(small.others_use)  # of one ground: a matter of geometry
+
+
+def test_requests_and_measurements_that_make_no_sense_are_refused():
+    active = ActiveIdentification(THESIS)
+    with pytest.raises(TerrainError, match="casters"):
+        active.request(active.initial_state(), (4,))
+    with pytest.raises(TerrainError, match="force"):
+        active.step(active.initial_state(), steady(THESIS, force=np.full((4, 2), np.nan)), 0.002)
+    with pytest.raises(TerrainError, match="growth"):
+        ActiveParameters(growth=0.0)
+    two = dataclasses.replace(THESIS, casters=THESIS.casters[:2])
+    with pytest.raises(TerrainError, match="at least 3"):
+        ActiveIdentification(two)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-0.7, 0.7), st.floats(-3.1, 3.1), st.integers(0, 3))
+def test_others_take_the_force_whatever_the_headings(speed, heading, caster):
+    active = ActiveIdentification(THESIS)
+    A = wheel_jacobian(THESIS, np.full(4, heading) + np.array([0.0, 0.3, -0.2, 0.1]))
+    force = np.array([100.0 * speed, 10.0])
+    others = active._others(A, caster, force)
+    rows = np.delete(np.arange(8), [2 * caster, 2 * caster + 1])
+    np.testing.assert_allclose(A[rows].T @ others.ravel(), -A[2 * caster : 2 * caster + 2].T @ force, atol=1e-9)

@@ -1,0 +1,289 @@
+"""The estimator of one wheel: accuracy, honesty, changes of ground, and everything that can be wrong with its readings."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+from pcw_description import load_robot
+from pcw_description.contact.contact_model import friction_coefficient, tyre_parameters
+from pcw_terrain import (
+    TerrainError,
+    TerrainEstimator,
+    TerrainParameters,
+    ThesisRls,
+    ThesisRlsParameters,
+    WheelReading,
+)
+from pcw_terrain.friction_shape import shape_at, shape_table
+from pcw_terrain.studies import terrain_study
+from pcw_terrain.studies.terrain_study import RATE, estimator_of, ground, readings_of, swept_run, thesis_run
+from pcw_terrain.terrain_estimator import (
+    BLOCK_TIME_CONSTANTS,
+    IS_VALID,
+    LAMBDA_P,
+    LAMBDA_VARIANCE,
+    MU_P,
+    MU_VARIANCE,
+    REASON,
+    WRONG_SIGN,
+    block_share,
+    noise_gain,
+)
+
+# Small versions of what `terrain_study` measures with 200 seeds.
+SEEDS = range(25)
+
+
+def constant(rolling=1.0, velocity=0.95, force=60.0, load=200.0):
+    return WheelReading(rolling, velocity, force, load)
+
+
+# --- Accuracy, with the settings of the thesis ------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def thesis_accuracy():
+    return terrain_study.accuracy([thesis_run(seed) for seed in SEEDS], (0.8, 0.999))
+
+
+def test_with_the_settings_of_the_thesis_it_is_accurate(thesis_accuracy):
+    """The bar: 2 % and 5 %, median. 25 runs scatter by about a quarter of what is allowed."""
+    ours = thesis_accuracy["ours"]
+    assert ours.reached >= 15
+    assert ours.mu_error < 0.02 and ours.lambda_error < 0.05
+    assert abs(ours.mu_bias) < 0.01 and abs(ours.lambda_bias) < 0.02
+    # Of some 20 intervals at 95 % one is missed on average, and four by one chance in seventy.
+    assert ours.mu_coverage > 0.8 and ours.lambda_coverage > 0.8
+    assert ours.valid >= 0.8 * ours.reached
+
+
+def test_the_estimator_of_the_thesis_is_not(thesis_accuracy):
+    """Errors in variables: a long memory makes it sure of a wrong answer, a short one makes it follow the noise."""
+    for name, found in thesis_accuracy.items():
+        if name != "ours":
+            assert found.mu_error > 0.05 and found.lambda_error > 0.1
+
+
+def test_the_estimator_of_the_thesis_is_right_without_noise():
+    """That it is biased by the noise and not by a mistake in how it was written down: a slow sweep, no filter to speak of."""
+    wheel, run = swept_run(3, (1.5, 1.5))
+    rolling, truth = run.rolling_speed, wheel.contact
+    exact = np.column_stack([rolling, run.velocity, run.force, np.full(len(rolling), wheel.normal_force)])
+    mu_p, lambda_p = ThesisRls(ThesisRlsParameters(0.999, filter_rate=500.0)).run(exact, 1.0 / RATE)
+    assert mu_p[-1] == pytest.approx(truth.mu_p, rel=0.1) and lambda_p[-1] == pytest.approx(truth.lambda_p, rel=0.2)
+
+
+def test_without_noise_it_is_exact():
+    """What is left is what the filter and the blocks average away of a moving slip: a tenth of a percent."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        wheel = terrain_study.GroundWheel(contact=ground(rng.uniform(0.1, 1.2), rng.uniform(0.04, 0.3)))
+        moments = np.arange(8000) / RATE
+        slip = 1.5 * wheel.contact.lambda_p * (0.5 - 0.5 * np.cos(math.tau * 0.8 * moments))
+        run = terrain_study.run_wheel(wheel, RATE, 8.0, 1.0, rng, slip=slip, noise=0.0, harmonics=0.0)
+        last = estimator_of(wheel).run(readings_of(wheel, run), 1.0 / RATE, 10)[-1]
+        assert last[MU_P] == pytest.approx(wheel.contact.mu_p, rel=0.002)
+        assert last[LAMBDA_P] == pytest.approx(wheel.contact.lambda_p, rel=0.005)
+
+
+@pytest.mark.parametrize("rate", [500.0, 2000.0])
+def test_the_rate_of_the_readings_does_not_matter(rate, monkeypatch):
+    monkeypatch.setattr(terrain_study, "RATE", rate)
+    wheel, run = swept_run(2, (1.5, 1.5))
+    last = estimator_of(wheel).run(readings_of(wheel, run), 1.0 / rate, 10)[-1]
+    for value, variance, truth in (
+        (last[MU_P], last[MU_VARIANCE], wheel.contact.mu_p), (last[LAMBDA_P], last[LAMBDA_VARIANCE], wheel.contact.lambda_p),
+    ):  # fmt: skip
+        assert abs(math.log(value / truth)) < 3.0 * math.sqrt(variance) + 0.005
+
+
+def test_braking_and_driving_backwards_give_the_same_as_driving():
+    """Mirrored in any way, the readings are those of the same ground."""
+    wheel, run = swept_run(4, (1.6, 1.6))
+    readings = readings_of(wheel, run)
+    backwards = readings * np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    forth, back = (estimator_of(wheel).run(values, 1.0 / RATE, 10)[-1] for values in (readings, backwards))
+    np.testing.assert_allclose(forth[:IS_VALID], back[:IS_VALID], rtol=1e-9)
+
+
+# --- Honesty ----------------------------------------------------------------------------------------------
+
+
+def test_below_half_of_the_critical_slip_nothing_is_called_valid():
+    """The bar is 1 % of runs, so that one of 25 runs may be."""
+    called, of = terrain_study.gated(SEEDS, (0.2, 0.5))
+    assert of == 25 and called <= 1
+
+
+def test_changes_of_ground_are_found_and_settled():
+    found = terrain_study.change_times(range(6))
+    assert np.quantile(found.detected, 0.9) <= 0.3 and np.isfinite(found.detected).all()
+    assert np.median(found.settled) <= 0.8 and np.quantile(found.settled, 0.8) <= 1.0
+
+
+def test_steady_ground_does_not_change():
+    """Two minutes here, and in the study for hours."""
+    changes, _ = terrain_study.false_changes(range(4), 30.0)
+    assert changes == 0
+
+
+@pytest.mark.nightly
+def test_steady_ground_does_not_change_for_ten_minutes():
+    changes, _ = terrain_study.false_changes(range(6), 600.0)
+    assert changes == 0
+
+
+def test_a_straight_line_is_no_curve():
+    """A wheel whose friction is proportional to its slip up to the end of the readings has no peak that could be known."""
+    estimator, rng = TerrainEstimator(), np.random.default_rng(0)
+    moments = np.arange(6000) / RATE
+    slip = 0.05 * (0.5 - 0.5 * np.cos(3.0 * moments))
+    rolling = np.full(6000, 1.0)
+    readings = np.column_stack([rolling, 1.0 - slip, 200.0 * 6.0 * slip, np.full(6000, 200.0), 0.0 * slip, 0.0 * slip])
+    readings[:, :2] *= 1.0 + 0.02 * rng.uniform(-1.0, 1.0, (6000, 2))
+    assert not estimator.run(readings, 1.0 / RATE)[:, IS_VALID].any()
+
+
+# --- What can be wrong ------------------------------------------------------------------------------------
+
+
+def test_a_torque_of_the_wrong_sign_is_told_and_never_valid():
+    wheel, run = swept_run(1, (1.5, 1.5))
+    readings = readings_of(wheel, run) * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+    found = estimator_of(wheel).run(readings, 1.0 / RATE)
+    assert not found[:, IS_VALID].any()
+    assert found[-1, REASON] == WRONG_SIGN
+
+
+def test_at_rest_nothing_is_known_and_nothing_is_forgotten():
+    wheel, run = swept_run(1, (1.5, 1.5))
+    estimator, readings = estimator_of(wheel), readings_of(wheel, run)
+    rest = np.tile([0.0, 0.0, 0.0, wheel.normal_force, 0.0, 0.0], (3000, 1))
+    noisy = rest + np.random.default_rng(0).normal(0.0, 1e-4, rest.shape)
+    assert not estimator.run(noisy, 1.0 / RATE)[:, IS_VALID].any()
+    found = estimator.run(np.concatenate([readings, noisy]), 1.0 / RATE)
+    assert found[len(readings) - 1, IS_VALID] and found[-1, IS_VALID]
+    # The filter's tail is at speed still.
+    assert found[-1, MU_P] == pytest.approx(found[len(readings) - 1, MU_P], rel=0.02)
+
+
+def test_a_motion_that_is_reversed_goes_through_rest():
+    wheel, run = swept_run(5, (1.5, 1.5))
+    readings = readings_of(wheel, run)
+    stop = readings[-1:] * np.linspace(1.0, -1.0, 1000)[:, None]
+    stop[:, 3] = wheel.normal_force
+    backwards = readings * np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    last = estimator_of(wheel).run(np.concatenate([readings, stop, backwards]), 1.0 / RATE)[-1]
+    assert last[IS_VALID] and last[MU_P] == pytest.approx(wheel.contact.mu_p, rel=0.05)
+
+
+@pytest.mark.parametrize("field", ["rolling_speed", "velocity", "force", "normal_force", "lateral_slip", "lateral_force"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_reading_that_is_not_finite_is_refused_and_changes_nothing(field, value):
+    estimator = TerrainEstimator()
+    state, _ = estimator.step(estimator.initial_state(), constant(), 0.002)
+    before = state.numbers.copy()
+    bad = WheelReading(**({"rolling_speed": 1.0, "velocity": 0.9, "force": 1.0, "normal_force": 100.0} | {field: value}))
+    with pytest.raises(TerrainError, match="allowed"):
+        estimator.step(state, bad, 0.002)
+    np.testing.assert_array_equal(state.numbers, before)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.001, math.nan, math.inf])
+def test_a_step_of_time_that_is_none_is_refused(dt):
+    estimator = TerrainEstimator()
+    with pytest.raises(TerrainError, match="dt"):
+        estimator.step(estimator.initial_state(), constant(), dt)
+
+
+def test_a_step_does_not_change_the_state_before():
+    estimator = TerrainEstimator()
+    state, _ = estimator.step(estimator.initial_state(), constant(), 0.002)
+    before = state.numbers.copy(), state.sums.copy(), state.history.copy()
+    for _ in range(30):
+        estimator.step(state, constant(force=90.0), 0.002)
+    for now, then in zip((state.numbers, state.sums, state.history), before, strict=True):
+        np.testing.assert_array_equal(now, then)
+
+
+def test_nothing_diverges_whatever_comes():
+    """Readings that belong to no wheel: an estimate may be wrong, but it is finite, within what is possible, or not there."""
+    rng = np.random.default_rng(0)
+    for scale in (1e-6, 1.0, 1e6):
+        readings = scale * rng.standard_cauchy((20_000, 6))
+        found = TerrainEstimator().run(readings, 0.002)
+        assert np.isfinite(found).all()
+        valid = found[found[:, IS_VALID] > 0.0]
+        assert ((valid[:, MU_P] > 0.02) & (valid[:, MU_P] < 2.0)).all()
+        assert ((valid[:, LAMBDA_P] >= 0.01) & (valid[:, LAMBDA_P] <= 0.8)).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.tuples(*6 * [st.floats(-1e9, 1e9)]), min_size=1, max_size=60), st.floats(1e-6, 10.0),
+)  # fmt: skip
+def test_finite_readings_never_give_numbers_that_are_not(rows, dt):
+    found = TerrainEstimator().run(np.array(rows, dtype=float), dt)
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("cut_off", 0.0), ("inertia", -1.0), ("memory", 0.0), ("least_speed", math.nan), ("least_slip", 0.3),
+     ("slip_spread", 0.0), ("least_blocks", 1), ("slip_accuracy", 2.0)],
+)  # fmt: skip
+def test_parameters_that_are_not_allowed_are_named(field, value):
+    with pytest.raises(TerrainError, match=field):
+        TerrainParameters(**{field: value})
+    with pytest.raises(TerrainError, match="forgetting_factor"):
+        ThesisRlsParameters(forgetting_factor=1.5)
+
+
+# --- What it stands on ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.002])
+def test_noise_that_the_filter_leaves_is_what_it_is_said_to_be(dt):
+    """White noise through two poles, one more, and a mean: variances within 5 %, as 4e5 readings tell them."""
+    rng, pole, rate = np.random.default_rng(0), 195.0, 60.0
+    x = rng.standard_normal(400_000)
+    p, q = math.exp(-pole * dt), math.exp(-rate * dt)
+    for share in (1.0 - p, 1.0 - p):
+        x = _low_pass(x, share)
+    assert x.var() == pytest.approx(noise_gain(pole, dt), rel=0.05)
+    length = round(BLOCK_TIME_CONSTANTS / pole / dt)
+    for signal, one_more in ((x, math.inf), (_low_pass(x, 1.0 - q), rate)):
+        means = signal[: len(signal) // length * length].reshape(-1, length).mean(axis=1)
+        assert means.var() == pytest.approx(noise_gain(pole, dt) * block_share(pole, one_more, length * dt), rel=0.08)
+
+
+def _low_pass(x, share):
+    return lfilter([share], [1.0, share - 1.0], x)
+
+
+@pytest.mark.parametrize("model", ["kiencke", "magic_formula", "burckhardt"])
+def test_shapes_are_those_of_the_contact_models(model):
+    contact = dataclasses.replace(load_robot("thesis").contact, model=model)
+    table, tyre = shape_table(contact), tyre_parameters(contact)
+    for x in (-2.0, -0.3, 0.0, 0.1, 0.7, 1.0, 1.5, 6.0):
+        g, slope, bend = shape_at(table, x)
+        assert g == pytest.approx(friction_coefficient(tyre, x * contact.lambda_p, 0.0)[0] / contact.mu_p, abs=2e-4)
+        below, above = shape_at(table, x - 0.01)[0], shape_at(table, x + 0.01)[0]
+        assert slope == pytest.approx((above - below) / 0.02, rel=0.03, abs=0.02)
+    assert shape_at(table, 1.0)[0] == pytest.approx(1.0, abs=1e-3) and abs(shape_at(table, 1.0)[1]) < 0.02
+
+
+def test_the_study_writes_its_document_and_figures(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(terrain_study, "false_changes", lambda seeds, duration: (0, duration))
+    assert terrain_study.main(["--seeds", "2", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "terrain.md").read_text()
+    assert text in capsys.readouterr().out
+    for name in ("fig_5_19", "fig_5_20"):
+        assert f"({name}.svg)" in text and (tmp_path / f"{name}.svg").exists()
+        data = np.genfromtxt(tmp_path / f"{name}.csv", delimiter=",", names=True)
+        assert np.isfinite(data["ours"][-1]) and data["ours_low"][-1] < data["ours"][-1] < data["ours_high"][-1]
