@@ -27,6 +27,7 @@ NODES = {
     "robot_description": ("pcw_description.nodes.robot_description", "RobotDescriptionNode"),
     "slip_observer": ("pcw_estimation.nodes.slip_observer", "SlipObserverNode"),
     "slip_fusion": ("pcw_estimation.nodes.slip_fusion", "SlipFusionNode"),
+    "terrain": ("pcw_terrain.nodes.terrain", "TerrainNode"),
     "transforms": ("pcw_description.nodes.transforms", "TransformsNode"),
 }
 
