@@ -13,14 +13,15 @@ from std_srvs.srv import SetBool, Trigger
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
-from pcw_description.nodes.node_tools import COMMAND, declare, joint_state_arrays, run_node, stamp_to_ns
+from pcw_description.nodes.node_tools import COMMAND, declare, run_node, stamp_to_ns
 
 from ..plants.factory import make_plant
 from ..plants.plant import PLANT_NAMES, PlantError
 from ..sensors import VELOCITY_SOURCES
-from ..simulated_robot import JointCommand, SimulatedRobot
+from ..simulated_robot import SimulatedRobot
 from ..stamping import LARGEST_JITTER, LARGEST_LOSS, StampingParameters, TopicStamps
 from .bridge_messages import BridgePublishers
+from .joint_command_messages import read_joint_command
 
 # As fast as possible means this much work between two looks at the executor [s].
 WORK_SLICE = 0.005
@@ -158,7 +159,7 @@ class BridgeNode(Node):
 
     def _on_command(self, message: JointState) -> None:
         try:
-            self._simulated.command(self._read_command(message))
+            self._simulated.command(read_joint_command(message, self._joint_index, (self.robot.n, 2)))
         except PcwError as error:
             self._simulated.command(None)
             self._refused_commands += 1
@@ -167,18 +168,6 @@ class BridgeNode(Node):
         if self._lockstep and stamp_to_ns(message.header.stamp) >= self._outputs.joint_states_stamp_ns:
             self._answered = True
             self._go_on()
-
-    def _read_command(self, message: JointState) -> JointCommand:
-        if set(message.name) != set(self._joint_index) or len(message.name) != len(self._joint_index):
-            raise PlantError(f"joint command for {list(message.name)}; allowed: each of {list(self._joint_index)} once")
-        for field in ("velocity", "effort"):
-            count = len(getattr(message, field))
-            if count not in (0, len(message.name)):
-                raise PlantError(f"joint command: {count} values of {field}; allowed: one a joint, or none")
-        _, velocity, effort = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
-        return JointCommand(
-            effort=effort if len(message.effort) else None, velocity=velocity if len(message.velocity) else None
-        )
 
     # --- Services ---------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""A joint_commands message as a command to the drives, with the same rules as in the bridge."""
+"""A joint_commands message as a command, by the same rules for simulated and real drives."""
 
 from __future__ import annotations
 
