@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pcw_control.computed_torque import ComputedTorque, ComputedTorqueMeasurement
-from pcw_control.computed_torque import initial_state as initial_control
+from pcw_control.computed_torque import ComputedTorque
+from pcw_control.controller_interface import ControllerMeasurement
 from pcw_control.quintic_trajectory import TrajectoryPoint
 from pcw_control.torque_limits import TorqueLimits, limit_torque
 from pcw_description.odometry import OdometryParameters, OdometryState, update
@@ -131,7 +131,8 @@ def active_run(
     inner = make_plant(plant, real)
     inner.reset(steer_angle=np.full(n, heading))
     simulated = SimulatedRobot(inner, seed)
-    controller, control = ComputedTorque(believed), initial_control()
+    controller = ComputedTorque(believed)
+    control = controller.initial_state()
     limits, torque, asked = TorqueLimits.of_robot(believed), np.zeros((n, 2)), np.zeros((n, 2))
     observer = RobotSlidingModeObserver(believed, SlidingModeParameters(measured=measured))
     observed = observer.initial_state()
@@ -171,7 +172,7 @@ def active_run(
         if under_test >= 0 and output.testing != under_test:
             odometry, live = _learn(record, under_test, knowledge, odometry), terrain.initial_state()
         odometry, _ = update(believed, odometry_parameters, odometry, output.controller_position, dt)
-        seen = ComputedTorqueMeasurement(
+        seen = ControllerMeasurement(
             output.controller_position, _speeds(output, reading, measured), odometry.pose, saturated
         )
         point = line(now, heading)
