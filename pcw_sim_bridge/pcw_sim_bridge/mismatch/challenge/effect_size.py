@@ -16,13 +16,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pcw_description.robot_description import RobotDescription
+from pcw_description.robot_description import STEER, RobotDescription
 
+from ..errors import MismatchError
 from ..regression_problem import BoolArray, FloatArray, RegressionProblem
 from ..robot_channels import RobotProblemBuilder
 from .simulated_case import SimulatedRecording
 
 EXACT_ROUNDS = 3  # of re-tuning, each exact where the one before came out
+# Two runs whose casters are further apart than this are two motions [rad].
+TURNED_OTHERWISE = 2.0
 # A part of the samples in which an effect does nothing is no part of its region.
 REGION_QUANTILES = (0.01, 0.99)
 
@@ -66,10 +69,21 @@ class HealthyChannels:
         self._deviations = self.problem.nuisance_deviations()
         self.floor = self._noise_floor()
         self._quiet = _build(nominal, quiet, self._cutoff)
+        self._headings = [_headings(recording) for recording in quiet]
 
     def size(self, recordings: Sequence[SimulatedRecording]) -> EffectSize:
-        """Return how large an effect is that these runs without noise have and the healthy ones have not."""
+        """Return how large an effect is that these runs without noise have and the healthy ones have not.
+
+        Raises:
+            MismatchError: with it a caster turns round the other way; what then differs is another motion, and no effect.
+        """
         problem = self.problem
+        for recording, healthy in zip(recordings, self._headings, strict=True):
+            headings = _headings(recording)
+            length = min(len(headings), len(healthy))
+            apart = float(np.abs(headings[:length] - healthy[:length]).max(initial=0.0))
+            if apart > TURNED_OTHERWISE:
+                raise MismatchError(f"headings apart by {apart:.3g} rad; allowed: {TURNED_OTHERWISE:g} rad, the same motion")
         with_effect = _build(self._nominal, recordings, self._cutoff)
         change = self._change(with_effect)
         rows = problem.valid & np.isfinite(change)
@@ -118,6 +132,11 @@ class HealthyChannels:
         solution = np.linalg.solve(scaled.T @ scaled + np.eye(scaled.shape[1]), scaled.T @ wanted)
         moved = self._deviations * solution
         return values - self._columns @ moved, moved
+
+
+def _headings(recording: SimulatedRecording) -> FloatArray:
+    """Steering angles (T, n) [rad]."""
+    return recording.joint_states.position[:, :, STEER]
 
 
 def _build(nominal: RobotDescription, recordings: Sequence[SimulatedRecording], cutoff: float) -> RegressionProblem:
