@@ -133,13 +133,20 @@ class HeldOut:
         """How much better held-out data are foretold with an effect than without, and how much it does there at all [nats].
 
         The first is the logarithm of the ratio of their predictive densities, log p(held out | fitted): numbers of the
-        description that the fitted data leave open are open for both, and what they would have to move is counted once.
+        description that the fitted data leave open are open for both. What the fitted data have moved them by foretells as
+        well as an effect does, however far that is; so what it costs is counted, too.
         """
-        kept = self._kept(index)
-        help_ = self._foretold(self._kept(None)) - self._foretold(kept)
+        both, alone = self.means(), self.means(index)
+        better = self._foretold(self._kept(None)) - self._foretold(self._kept(index))
+        better += self._retuning(alone) - self._retuning(both)
         rows = slice(*self.span(index))
-        work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(self.means(), self.test, strict=True))
-        return help_, 0.5 * float(work)
+        work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
+        return better, 0.5 * float(work)
+
+    def _retuning(self, means: FloatArray) -> float:
+        """Half the squared distance of the description's numbers from nominal, in tolerances."""
+        moved = means[:, : self.nuisances] / self.deviations[: self.nuisances]
+        return 0.5 * float(np.mean(np.sum(moved**2, axis=1)))
 
     def _foretold(self, kept: IntArray) -> float:
         """Logarithm of the predictive density of all folds, but for what no choice of columns changes."""
