@@ -223,6 +223,9 @@ def test_lifecycle_lets_go_on_deactivation_and_can_be_cleaned_up(ros):
     assert robot.commands == []  # configured is not active
     assert change_state(ros, Transition.TRANSITION_ACTIVATE)
     robot.run(robot.drives)
+    # A transition that the state does not have ended the node: rclpy raises where it should refuse.
+    assert not change_state(ros, Transition.TRANSITION_ACTIVATE)
+    robot.run(robot.drives)
     assert change_state(ros, Transition.TRANSITION_DEACTIVATE)
     ros.wait_for(robot.let_go)
     count = len(robot.commands)

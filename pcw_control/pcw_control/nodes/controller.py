@@ -11,11 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from rclpy.clock import Clock, ClockType
-from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.lifecycle import State, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot, odometry
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
+from pcw_description.nodes.lifecycle import RobustLifecycleNode
 from pcw_description.nodes.node_tools import (
     COMMAND,
     COMMAND_SOURCE,
@@ -48,7 +49,7 @@ ODOMETRY = odometry.OdometryParameters()
 LONGEST_GAP = 0.1  # [s]
 
 
-class ControllerNode(LifecycleNode):
+class ControllerNode(RobustLifecycleNode):
     """Follows cmd_vel, or a quintic trajectory to goal_pose, by joint torques of the controller that is chosen.
 
     The torque is computed in the callback of joint_states and not by a timer: it belongs to just that measurement, a timer

@@ -10,15 +10,14 @@ import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 
-from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock, ClockType
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.lifecycle import LifecycleNode, State, TransitionCallbackReturn
+from rclpy.lifecycle import State, TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
+from pcw_description.nodes.lifecycle import RobustLifecycleNode
 from pcw_description.nodes.node_tools import (
     COMMAND,
     SENSOR_STREAM_SOURCE,
@@ -42,7 +41,7 @@ SETTLING = 0.2  # in which drives say that they are off [s]
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class CanDriverNode(LifecycleNode):
+class CanDriverNode(RobustLifecycleNode):
     """Torques from joint_commands to the drives, joint_states from them.
 
     configure: open the buses, check and set up every drive, without torque; joint_states begin.
@@ -84,17 +83,6 @@ class CanDriverNode(LifecycleNode):
             self.trigger_activate()
 
     # --- Lifecycle ---------------------------------------------------------------------------------------
-
-    def _LifecycleNodeMixin__on_change_state(  # noqa: N802 - the name that rclpy calls
-        self, request: ChangeState.Request, response: ChangeState.Response
-    ) -> ChangeState.Response:
-        """Refuse a transition that the state does not have: rclpy of Jazzy lets such a request end the node."""
-        try:
-            return super()._LifecycleNodeMixin__on_change_state(request, response)
-        except rclpy_implementation.RCLError as error:
-            self.get_logger().error(f"transition refused: {error}")
-            response.success = False
-            return response
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Open the buses and set up every drive."""
