@@ -29,14 +29,17 @@ from pcw_description.effects.kinds import (
     JointTorqueEffect,
 )
 from pcw_sim_bridge import simulated_run
+from pcw_sim_bridge.mismatch import explanation
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
+from pcw_sim_bridge.mismatch.explanation import Estimate, NamedTerm
 from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
 from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier
-from pcw_sim_bridge.mismatch.regression_problem import Sites
+from pcw_sim_bridge.mismatch.regression_problem import Sites, Term
 from pcw_sim_bridge.mismatch.report import write_report
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.rollout import HORIZONS
-from pcw_sim_bridge.mismatch.unknown_law import Basis, Factor, Law, Place, hypotheses
+from pcw_sim_bridge.mismatch.unknown_law import UNKNOWN, Basis, Factor, Law, Place, hypotheses
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import Plant, PlantState
 
@@ -274,6 +277,15 @@ def test_a_product_on_the_chassis_is_tried_and_is_a_file(tmp_path):
     wrench = effect.contribution(at, made.parameters)
     np.testing.assert_allclose(wrench[:, -1], moment, rtol=1e-4, atol=1e-4)
     assert not wrench[:, :2].any() and "v_x and v_y" in effect.summary
+
+
+def test_two_laws_are_no_torque_constants_to_be_doubted():
+    """With two laws found, the second analysis of their names asked the vocabulary for the effect `unknown`, and ended."""
+    estimates = {"weight_0": Estimate(1.0, "N m", 0.9, 1.1)}
+    terms = [Term(UNKNOWN, target, (), ({},), lambda shape: np.zeros((1, 1, 1))) for target in (("a",), ("b",), ("a",))]
+    nothing = np.zeros((1, 1))
+    laws = [NamedTerm(Instance(k, (), ()), term, estimates, 1.0, (), 9.0, 9.0, nothing) for k, term in enumerate(terms)]
+    assert explanation._doubted_by_scale(laws) == tuple(laws)
 
 
 def test_a_file_passes_the_checks_of_the_house(tmp_path):

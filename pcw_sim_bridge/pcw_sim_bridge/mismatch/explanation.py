@@ -425,8 +425,10 @@ def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
         same = one.term.effect == other.term.effect and one.term.target == other.term.target and len(one.term.target) > 1
         pairs = [(one.estimates[name], other.estimates[name]) for name in one.estimates if name in other.estimates]
         overlap = all(a.low <= b.high and b.low <= a.high for a, b in pairs)
+        if not (same and pairs and overlap and one.term.axis != other.term.axis):
+            continue
         alike = tuple(name for name in get(one.term.effect).look_alikes if get(name).target_kind == "chassis")
-        if not (same and pairs and overlap and alike and one.term.axis != other.term.axis):
+        if not alike:
             continue
         for index in (first, second):
             entry = doubted[index]
