@@ -250,7 +250,7 @@ def _law(sums: FloatArray) -> tuple[Fault | None, float, float]:
         laws.append((mm - m * m, Fault.STUCK, m))
     if pp > MOVES**2 * variance:
         laws.append((mm - pm * pm / pp, Fault.SCALE, pm / pp))
-    least, kind, number = min(laws)
+    least, kind, number = min(laws, key=lambda law: law[0])  # of two that do as well, the one that comes first
     return (kind, number, p) if least <= explained else (Fault.NONE, 0.0, p)
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from pcw_description import load_robot
 from pcw_estimation import EstimationError, Fault, FaultIsolation, FaultParameters, SlipConsensus
+from pcw_estimation.fault_isolation import _law
 from pcw_estimation.studies.encoder_study import drawn_scenario
 from pcw_estimation.studies.fault_study import KINDS, diagnose
 
@@ -31,6 +32,13 @@ def test_slip_is_no_fault():
             state, finding = detector.step(state, driven.position[k], driven.velocity[k], 0.002 if k else 0.0)
             isolation.update(driven.position[k], driven.velocity[k], finding, 0.002 if k else 0.0)
             assert not isolation.faults(), (seed, driven.stamp[k])
+
+
+def test_two_laws_that_do_as_well_are_no_error():
+    """A speed read as half of one that never changes is a scale or a drift; the node ended on it."""
+    weight, foretold, measured, variance = 10.0, 2.0, 1.0, 1e-6
+    moments = [1.0, foretold, measured, foretold**2, foretold * measured, measured**2, variance]
+    assert _law(weight * np.array(moments)) == (Fault.DRIFTING, measured - foretold, foretold)
 
 
 def test_a_fault_that_is_over_is_withdrawn_and_reset_forgets():

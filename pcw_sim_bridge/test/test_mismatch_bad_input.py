@@ -291,7 +291,8 @@ def test_interrupting_leaves_the_earlier_report_and_nothing_else(recorded: Path,
     time.sleep(0.5)
     run.send_signal(signal.SIGINT)
     _, errors = run.communicate(timeout=120)
-    assert run.returncode == 130, errors
+    # Ctrl-C in an import from compiled code ends Python by the signal, whatever its exit code: a shell sees 130 either way.
+    assert run.returncode in (130, -signal.SIGINT), errors
     assert "interrupted" in errors and "Traceback" not in errors
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["report"]
