@@ -40,6 +40,7 @@ setup(
         "console_scripts": [
             "benchmark = pcw_bringup_scripts.benchmark:main",
             "compose = pcw_bringup_scripts.compose:main",
+            "composed_rate = pcw_bringup_scripts.composed_rate:main",
             "demo_run = pcw_bringup_scripts.demo_run:main",
             "manoeuvre = pcw_bringup_scripts.nodes.manoeuvre:main",
         ],

@@ -41,6 +41,7 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "command_latency = pcw_control.nodes.command_latency:main",
             "computed_torque = pcw_control.nodes.computed_torque:main",
             "controller = pcw_control.nodes.controller:main",
             "gain_check = pcw_control.gain_check:main",

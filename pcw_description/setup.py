@@ -30,7 +30,10 @@ setup(
     ],
     python_requires=">=3.11",
     install_requires=["setuptools"],
-    extras_require={"test": ["pytest"]},
+    extras_require={
+        "test": ["pytest"],
+        "threadpoolctl": ["threadpoolctl>=3.1.0"],  # nodes keep linear algebra to one thread; rosdep has no key for it
+    },
     zip_safe=False,
     maintainer="PCW maintainers",
     maintainer_email="pcw-maintainers@example.org",

@@ -44,6 +44,9 @@ from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import Plant
 from pcw_sim_bridge.sensors import JointReading
 from pcw_sim_bridge.simulated_robot import JointCommand, SimulatedRobot
+from pcw_terrain.robot_terrain import RobotReading, RobotTerrain
+from pcw_terrain.slip_slope import SlipSlope
+from pcw_terrain.terrain_estimator import TerrainEstimator, TerrainParameters, WheelReading
 
 FORMAT = "pcw_benchmark/1"
 STEP = 1e-3  # of the plants [s]
@@ -231,6 +234,44 @@ def slip_observer(measured: str) -> Prepare:
     return prepare
 
 
+def terrain(robot: RobotDescription) -> Callable[[], float]:
+    """The ground under all casters, slip slopes included, from slips that swing; what the terrain node does per reading."""
+    calls, dt, n = 2000, 2e-3, robot.n
+    rng = np.random.default_rng(6)
+    estimators, slopes = RobotTerrain(robot), SlipSlope(robot)
+    readings = []
+    for k in range(calls):
+        slip = 0.1 * (1.0 - np.cos(4.0 * dt * k)) * np.ones(n)
+        sensed = np.column_stack([0.8 / (1.0 - slip), np.zeros(n)]) + rng.normal(0.0, 1e-3, (n, 2))
+        force = np.column_stack([2000.0 * slip / (1.0 + 100.0 * slip * slip), np.zeros(n)])
+        readings.append(RobotReading(sensed, np.column_stack([sensed[:, 0] - 0.8, np.zeros(n)]), force, np.zeros(n)))
+
+    def work() -> float:
+        state, creep = estimators.initial_state(), slopes.initial_state()
+        for reading in readings:
+            state, found = estimators.step(state, reading, dt)
+            creep, _ = slopes.step(creep, reading, found.normal_force, dt)
+        return calls
+
+    return work
+
+
+def terrain_of_one_wheel(robot: RobotDescription) -> Callable[[], float]:
+    """The estimator of one wheel, whose slip swings about its critical slip."""
+    calls, dt = 2000, 2e-3
+    estimator = TerrainEstimator(TerrainParameters(contact=robot.tyres[0]))
+    slips = 0.1 * (1.0 - np.cos(4.0 * dt * np.arange(calls)))
+    readings = [WheelReading(0.8 / (1.0 - s), 0.8, 2000.0 * s / (1.0 + 100.0 * s * s), 200.0) for s in slips.tolist()]
+
+    def work() -> float:
+        state = estimator.initial_state()
+        for reading in readings:
+            state, _ = estimator.step(state, reading, dt)
+        return calls
+
+    return work
+
+
 def with_all_effects(prepare: Prepare) -> Prepare:
     """The same task with every effect of the vocabulary at work, at its typical size, on all casters."""
 
@@ -333,6 +374,8 @@ TASKS = (
     Task("Lambda and theta", MICROSECONDS, 5.0, augmented_object),
     Task("slip observer of the robot, from speeds", MICROSECONDS, 40.0, slip_observer("speed")),
     Task("angle-only slip observer of the robot", MICROSECONDS, 40.0, slip_observer("angle")),
+    Task("terrain of all casters, one reading", MICROSECONDS, None, terrain),
+    Task("terrain of one wheel, one step", MICROSECONDS, 20.0, terrain_of_one_wheel),
     Task("reduced plant at 1 ms, in batch", REAL_TIME, 800.0, reduced_in_batch),
     Task("reduced plant at 1 ms, stepped from Python", REAL_TIME, 200.0, reduced_stepped(read=False)),
     Task("the same, its state read after each step", REAL_TIME, None, reduced_stepped(read=True)),

@@ -34,6 +34,7 @@ def test_one_run_prints_and_writes_every_figure(tmp_path, capsys):
         ("Lambda", "us", 5.0),
         ("slip", "us", 40.0),
         ("angle-only", "us", 40.0),
+        ("terrain", "us", 20.0),
         ("reduced", "x real time", 800.0),
         ("reduced", "x real time", 200.0),
         ("PyBullet", "x real time", 8.0),

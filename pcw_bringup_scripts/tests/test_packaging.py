@@ -48,7 +48,7 @@ KEY_OF_MODULE = {
     "zstandard": "mcap-ros2-support",
 }
 # Modules that rosdep has no key for: only an extra may bring them.
-WITHOUT_KEY = {"distributed"}
+WITHOUT_KEY = {"distributed", "threadpoolctl"}
 # Needed without being imported.
 NOT_IMPORTED = {"ros2launch", "python3-msgpack"}
 

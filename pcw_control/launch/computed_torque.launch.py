@@ -1,31 +1,18 @@
-"""Computed torque: cmd_vel or goal_pose and joint_states in, joint_commands out.
+"""The controller under its first name: controller.launch.py with the node named computed_torque.
 
 ros2 launch pcw_control computed_torque.launch.py robot:=tidybot2 autostart:=false
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import LifecycleNode
-from launch_ros.parameter_descriptions import ParameterValue
-
-# name, default, meaning, type
-ARGUMENTS = (
-    ("robot", "thesis", "a .yaml file or a shipped robot", str),
-    ("autostart", "true", "configure and activate at once; otherwise by lifecycle services", bool),
-    ("cmd_vel_stamped", "true", "cmd_vel is a TwistStamped, not a Twist", bool),
-)
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
     """Entry point of `ros2 launch`."""
-    parameters = {name: ParameterValue(LaunchConfiguration(name), value_type=kind) for name, _, _, kind in ARGUMENTS}
+    path = PathJoinSubstitution([FindPackageShare("pcw_control"), "launch", "controller.launch.py"])
     return LaunchDescription(
-        [
-            *(DeclareLaunchArgument(name, default_value=value, description=what) for name, value, what, _ in ARGUMENTS),
-            LifecycleNode(
-                package="pcw_control", executable="computed_torque", name="computed_torque", namespace="", output="screen",
-                parameters=[parameters],
-            ),
-        ]
+        [IncludeLaunchDescription(PythonLaunchDescriptionSource(path), launch_arguments=[("node_name", "computed_torque")])]
     )

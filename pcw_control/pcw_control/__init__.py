@@ -24,6 +24,7 @@ from .force_distribution import (
     limited_forces,
     weighted_forces,
 )
+from .friction_budget import FrictionBudget, plan_within_friction
 from .friction_sharing import (
     FrictionOptimal,
     FrictionParameters,
@@ -71,6 +72,7 @@ __all__ = [
     "EXCITATIONS",
     "Excitation",
     "ForceReference",
+    "FrictionBudget",
     "FrictionOptimal",
     "FrictionParameters",
     "GatedTorque",
@@ -105,6 +107,7 @@ __all__ = [
     "make_controller",
     "make_excitation",
     "plan_point_to_point",
+    "plan_within_friction",
     "read_excitation",
     "weighted_forces",
 ]

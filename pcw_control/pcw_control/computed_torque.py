@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Self
 
 import numpy as np
 
@@ -43,8 +44,10 @@ from .controller_interface import (
     TwistReference,
     check_step,
     internal_force_kernel,
+    joint_torque_kernel,
     parameter,
 )
+from .delay_margin import BANDWIDTH, DELAY, derived_bandwidth
 from .errors import ControlError
 from .quintic_trajectory import TrajectoryPoint
 from .reference_motion import MotionParameters, ReferenceMotion
@@ -54,8 +57,8 @@ from .reference_motion import MotionParameters, ReferenceMotion
 class ComputedTorqueParameters(MotionParameters):
     """Gains, besides the limits of the reference.
 
-    The gains are those of a unit mass: Lambda scales them to the robot. The defaults place both poles of the pose error at
-    10 rad/s, five times below what a loop delay of 2 ms would disturb.
+    The gains are those of a unit mass: Lambda scales them to the robot. `of_robot` places both poles of the pose error at the
+    bandwidth that the robot's tyres and delay allow, `delay_margin.derived_bandwidth`; the defaults are those at 10 rad/s.
 
     Attributes:
         velocity_gain: k_d [1/s].
@@ -67,17 +70,21 @@ class ComputedTorqueParameters(MotionParameters):
     velocity_gain: float = parameter(20.0, "1/s", "gain on the velocity error, k_d", maximum=200.0)
     position_gain: float = parameter(100.0, "1/s^2", "gain on the pose error, k_p", maximum=1e4)
     integral_gain: float = parameter(50.0, "1/s^2", "gain on the integral of the velocity error", maximum=1e4)
-    integral_limit: tuple[float, float, float] = (1.0, 1.0, 3.0)
+    integral_limit: tuple[float, float, float] = parameter(
+        (1.0, 1.0, 3.0), "m/s^2, m/s^2, rad/s^2", "largest acceleration along x, y, yaw that the integral may ask for",
+        maximum=100.0,
+    )
 
-    def __post_init__(self) -> None:
-        """Check the parameters.
+    @classmethod
+    def of_robot(cls, robot: RobotDescription, delay: float = DELAY) -> Self:
+        """Return the gains of a robot: both poles at w, so that its loops bear a delay [s].
 
         Raises:
-            ControlError: names the field, its value and what is allowed.
+            KinematicsError: a caster without offset, whose steering torque makes no side force.
         """
-        super().__post_init__()
-        if len(self.integral_limit) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in self.integral_limit):
-            raise ControlError(f"integral_limit = {self.integral_limit!r} is not allowed; allowed: three numbers, at least 0")
+        robot.require_torque_control()
+        w = derived_bandwidth(robot, BANDWIDTH, delay)
+        return cls(velocity_gain=2.0 * w, position_gain=w * w, integral_gain=0.5 * w * w)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +110,7 @@ class Demand:
         steer_angle: headings (n,) [rad].
         A: wheel Jacobian (2n, 3).
         normal_inverse: (A^T A)^-1 (3, 3).
-        inertia: Lambda (3, 3).
+        inertia, bias: Lambda (3, 3) and theta (3,).
         incompatibility: (I - A A^+) B q_dot (n, 2) [m/s], the part of the slip that encoders see.
     """
 
@@ -113,6 +120,7 @@ class Demand:
     A: FloatArray
     normal_inverse: FloatArray
     inertia: FloatArray
+    bias: FloatArray
     incompatibility: FloatArray
 
 
@@ -121,14 +129,14 @@ class ComputedTorque:
 
     Args:
         robot: the robot; its `physics` are not known to a controller and are left out.
-        parameters: gains and limits.
+        parameters: gains and limits; None is `ComputedTorqueParameters.of_robot`.
 
     Raises:
         KinematicsError: a caster without offset, whose steering torque makes no side force.
     """
 
     def __init__(self, robot: RobotDescription, parameters: ComputedTorqueParameters | None = None) -> None:
-        self.parameters = parameters or ComputedTorqueParameters()
+        self.parameters = parameters or ComputedTorqueParameters.of_robot(robot)
         self.robot = robot
         self._n = robot.n
         self._model = AugmentedObjectModel(robot)
@@ -180,11 +188,11 @@ class ComputedTorque:
                 f"a ForceReference is not allowed for {type(self).__name__}; allowed: TwistReference, TrajectoryPoint"
             )
         if isinstance(reference, TwistReference):
-            state, V_dot = self._towards_twist(state, reference.twist, V, A, measurement.saturated, dt)
+            state, V_dot = self._towards_twist(state, reference.twist, V, A, steer_angle, measurement, dt)
         else:
             state, V_dot = self._towards_point(state, reference, measurement.pose, V)
         inertia, bias = self._model.evaluate(steer_angle, V)
-        return state, Demand(inertia @ V_dot + bias, V, steer_angle, A, normal_inverse, inertia, incompatibility)
+        return state, Demand(inertia @ V_dot + bias, V, steer_angle, A, normal_inverse, inertia, bias, incompatibility)
 
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
@@ -193,21 +201,31 @@ class ComputedTorque:
         return state, (demand.A @ (demand.normal_inverse @ demand.wrench)).reshape(self._n, 2)
 
     def _output(self, state: ComputedTorqueState, demand: Demand, F_con: FloatArray) -> ControllerOutput:
-        tau = np.einsum("nji,nj->ni", self._B, F_con)
+        tau = joint_torque_kernel(self._B, F_con)
         internal = internal_force_kernel(*self._geometry, demand.steer_angle, F_con)
         return ControllerOutput(tau, F_con, demand.wrench, demand.twist, state.reference_twist, internal)
 
     def _towards_twist(
-        self, state: ComputedTorqueState, target: FloatArray, V: FloatArray, A: FloatArray, saturated: bool, dt: float
+        self, state: ComputedTorqueState, target: FloatArray, V: FloatArray, A: FloatArray, steer_angle: FloatArray,
+        measurement: ControllerMeasurement, dt: float,
     ) -> tuple[ComputedTorqueState, FloatArray]:
         p = self.parameters
         V_d, V_dot_d = self._reference_motion.towards(state.reference_twist, target, A, dt)
+        part = self._carried(V_d, V_dot_d, A, steer_angle, measurement)
+        if part < 1.0:
+            V_d, V_dot_d = state.reference_twist + part * (V_d - state.reference_twist), part * V_dot_d
         e_dot = V_d - V
         e = state.error_integral
-        if not saturated and p.integral_gain > 0.0:
+        if not measurement.saturated and p.integral_gain > 0.0:
             e = np.minimum(np.maximum(e + e_dot * dt, -self._largest_integral), self._largest_integral)
         state = dataclasses.replace(state, reference_twist=V_d, error_integral=e)
         return state, V_dot_d + p.integral_gain * e + p.velocity_gain * e_dot
+
+    def _carried(
+        self, V_d: FloatArray, V_dot_d: FloatArray, A: FloatArray, steer_angle: FloatArray, measurement: ControllerMeasurement
+    ) -> float:
+        """Return the part of the wanted change of the twist that the ground is asked for; here all of it."""
+        return 1.0
 
     def _towards_point(
         self, state: ComputedTorqueState, point: TrajectoryPoint, pose: FloatArray, V: FloatArray

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol, TypeAlias
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar, Protocol, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from pcw_description.compiled import compiled
-from pcw_description.robot_description import FloatArray
+from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .errors import ControlError
 from .quintic_trajectory import TrajectoryPoint
@@ -117,20 +117,34 @@ class Controller(Protocol):
 
 
 def parameter(
-    default: float, unit: str, description: str, minimum: float = 0.0, maximum: float = 1e6, above: float | None = None
+    default: float | tuple[float, ...], unit: str, description: str, minimum: float = 0.0, maximum: float = 1e6,
+    above: float | None = None,
 ) -> Any:
-    """Return a dataclass field of a number with its unit, meaning and range; the node makes a ROS parameter of it."""
+    """Return a dataclass field of a number, or of several of one meaning, with unit, meaning and range.
+
+    The node makes a ROS parameter of it.
+    """
     low = minimum if above is None else above
     metadata = {"unit": unit, "description": description, "range": (low, maximum), "above": above is not None}
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def choice(default: Any, choices: Sequence[Any], description: str) -> Any:
+    """Return a dataclass field of a value out of a few, or of several such values; the node makes a ROS parameter of it."""
+    return dataclasses.field(default=default, metadata={"description": description, "choices": tuple(choices)})
+
+
 @dataclasses.dataclass(frozen=True)
 class ControllerParameters:
-    """Base of all parameters: fields made by `parameter` are checked when an instance is made."""
+    """Base of all parameters: fields made by `parameter` and `choice` are checked when an instance is made."""
 
     # What of the optional measurement the controller looks at: "slip", "friction", "external_wrench".
     uses: ClassVar[frozenset[str]] = frozenset()
+
+    @classmethod
+    def of_robot(cls, robot: RobotDescription) -> Self:
+        """Return the parameters that suit a robot: what a controller is made with when it is given none."""
+        return cls()
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -139,15 +153,56 @@ class ControllerParameters:
             ControlError: names the field, its value and what is allowed.
         """
         for field in dataclasses.fields(self):
-            if "range" not in field.metadata:
-                continue
-            value, (low, high) = getattr(self, field.name), field.metadata["range"]
-            excluded = field.metadata["above"] and value == low
-            if not (math.isfinite(value) and low <= value <= high) or excluded:
-                least = f"above {low:g}" if field.metadata["above"] else f"at least {low:g}"
-                raise ControlError(
-                    f"{field.name} = {value!r} is not allowed; allowed: a finite number, {least}, at most {high:g}"
-                )
+            value = getattr(self, field.name)
+            reason = reason_against(field, value)
+            if reason is not None:
+                raise ControlError(f"{field.name} = {value!r} is not allowed; allowed: {reason}")
+
+
+def reason_against(field: dataclasses.Field[Any], value: Any) -> str | None:
+    """Return what would be allowed for a field made by `parameter` or `choice`; None when the value is."""
+    meta = field.metadata
+    default: Any = field.default
+    several = isinstance(default, tuple)
+    values = tuple(value) if several else (value,)
+    if several and len(values) != len(default):
+        return f"{len(default)} values"
+    if "choices" in meta and any(one not in meta["choices"] for one in values):
+        return ", ".join(str(one) for one in meta["choices"])
+    if "range" not in meta:
+        return None
+    low, high = meta["range"]
+    if all(math.isfinite(one) and low <= one <= high and not (meta["above"] and one == low) for one in values):
+        return None
+    least = f"above {low:g}" if meta["above"] else f"at least {low:g}"
+    return f"{'finite numbers' if several else 'a finite number'}, {least}, at most {high:g}"
+
+
+def settable_fields(parameters: ControllerParameters, prefix: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    """Yield name, field and value of all that can be set, of parameters within parameters as well (`slip.loop_delay`)."""
+    for field in dataclasses.fields(parameters):
+        value = getattr(parameters, field.name)
+        if isinstance(value, ControllerParameters):
+            yield from settable_fields(value, f"{prefix}{field.name}.")
+        elif field.metadata:
+            yield prefix + field.name, field, value
+
+
+def with_values(parameters: ControllerParameters, value_of: Callable[[str], Any], prefix: str = "") -> ControllerParameters:
+    """Return parameters of the same kind with the value of every settable field taken from its name.
+
+    Raises:
+        ControlError: a value that is not allowed.
+    """
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(parameters):
+        value, name = getattr(parameters, field.name), prefix + field.name
+        if isinstance(value, ControllerParameters):
+            changed[field.name] = with_values(value, value_of, f"{name}.")
+        elif field.metadata:
+            found = value_of(name)
+            changed[field.name] = tuple(found) if isinstance(value, tuple) else found
+    return dataclasses.replace(parameters, **changed)
 
 
 def check_step(measurement: ControllerMeasurement, reference: Reference, dt: float, n: int) -> None:
@@ -232,3 +287,13 @@ def internal_force_kernel(steer_axis, caster_offset, steer_angle, force):  # typ
             found[k] = pull / math.hypot(x, y)
             k += 1
     return found
+
+
+@compiled
+def joint_torque_kernel(B, force):  # type: ignore[no-untyped-def]
+    """Return tau = B^T F_con (n, 2) [N m] for blocks B (n, 2, 2) and forces in the wheel frames (n, 2); in every cycle."""
+    torque = np.empty(force.shape)
+    for i in range(len(force)):
+        for j in range(2):
+            torque[i, j] = B[i, 0, j] * force[i, 0] + B[i, 1, j] * force[i, 1]
+    return torque

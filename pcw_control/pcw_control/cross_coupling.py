@@ -19,6 +19,7 @@ from pcw_description.robot_description import FloatArray, RobotDescription
 from .controller_interface import parameter
 from .delay_margin import derived_bandwidth
 from .resolved_motion_rate import ResolvedMotionRate, ResolvedMotionRateParameters
+from .slip_constraint_force import internal_part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +46,8 @@ class CrossCoupling(ResolvedMotionRate):
         # Wheels that move against each other feel 1 + c times the gain; it too has to bear the delay.
         strongest = derived_bandwidth(robot, (1.0 + self.parameters.coupling) * self.bandwidth) / self.bandwidth
         self.coupling = max(strongest - 1.0, 0.0)
+        self._unit = np.tile(np.eye(2), (robot.n, 1, 1))
 
     def _coupling(self, A: FloatArray, error: FloatArray, integral: FloatArray) -> FloatArray:
-        errors = np.stack([error.ravel(), integral.ravel()], axis=1)
-        relative = errors - A @ np.linalg.solve(A.T @ A, A.T @ errors)
-        pull = self._k_p * relative[:, 0].reshape(-1, 2) + self._k_i * relative[:, 1].reshape(-1, 2)
-        return self.coupling * pull
+        relative: FloatArray = self._k_p * internal_part(A, self._unit, error)
+        return self.coupling * (relative + self._k_i * internal_part(A, self._unit, integral))

@@ -24,6 +24,8 @@ import numpy as np
 
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, FloatArray, RobotDescription
 
+# Bandwidth of the velocity loops where delay allows it [rad/s]: five times below what a loop delay of 2 ms would disturb.
+BANDWIDTH = 10.0
 # What a loop has to bear at rest besides the hold, with tyres that damp nothing [s]; rolling, it bears about twice as much.
 DELAY = 0.001
 # A gain is never derived so small that the robot stands still, however soft its tyres are; in parts of the one asked for.

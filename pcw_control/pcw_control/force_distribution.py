@@ -93,10 +93,29 @@ def jacobian_forces(A: FloatArray, wrench: FloatArray, B_inverse: FloatArray) ->
         wrench: F (3,).
         B_inverse: inverses of the blocks of B (n, 2, 2).
     """
+    forces: FloatArray = _jacobian_forces(A, wrench, B_inverse)
+    return forces
+
+
+@compiled
+def _jacobian_forces(A, wrench, B_inverse):  # type: ignore[no-untyped-def]
     n = len(B_inverse)
-    J = np.einsum("nij,njk->nik", B_inverse, A.reshape(n, 2, 3)).reshape(2 * n, 3)
-    tau = (J @ np.linalg.solve(J.T @ J, wrench)).reshape(n, 2)
-    return np.einsum("nji,nj->ni", B_inverse, tau)
+    J, normal = np.empty((n, 2, 3)), np.zeros((3, 3))
+    for i in range(n):
+        for j in range(2):
+            for k in range(3):
+                J[i, j, k] = B_inverse[i, j, 0] * A[2 * i, k] + B_inverse[i, j, 1] * A[2 * i + 1, k]
+        for k in range(3):
+            for m in range(3):
+                normal[k, m] += J[i, 0, k] * J[i, 0, m] + J[i, 1, k] * J[i, 1, m]
+    x = solve_kernel(normal, wrench)
+    forces = np.empty((n, 2))
+    for i in range(n):
+        drive = J[i, 0, 0] * x[0] + J[i, 0, 1] * x[1] + J[i, 0, 2] * x[2]
+        steer = J[i, 1, 0] * x[0] + J[i, 1, 1] * x[1] + J[i, 1, 2] * x[2]
+        for j in range(2):
+            forces[i, j] = B_inverse[i, 0, j] * drive + B_inverse[i, 1, j] * steer
+    return forces
 
 
 def basic_forces(A: FloatArray, wrench: FloatArray) -> FloatArray:

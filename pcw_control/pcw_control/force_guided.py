@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -41,11 +41,12 @@ from .controller_interface import (
     ControllerOutput,
     ForceReference,
     Reference,
+    choice,
     parameter,
 )
-from .errors import ControlError
+from .delay_margin import DELAY
 from .force_distribution import solve_kernel
-from .reference_motion import _largest_joint_speed
+from .reference_motion import largest_joint_speed_kernel
 from .slip_constraint_force import SlipConstraintForce, SlipConstraintParameters
 
 # What guards V_f in a cycle; the last in this order that acted is reported.
@@ -90,20 +91,16 @@ class ForceGuidedParameters(ComputedTorqueParameters):
     speed_limit: float = parameter(0.8, "m/s", "largest guided speed", above=0.0, maximum=10.0)
     yaw_rate_limit: float = parameter(1.0, "rad/s", "largest guided yaw rate", above=0.0, maximum=10.0)
     power_limit: float = parameter(60.0, "W", "largest power of the push", above=0.0)
-    force_controlled: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    force_controlled: tuple[float, float, float] = choice(
+        (1.0, 1.0, 1.0), (0.0, 1.0), "1 for each of x, y, yaw that follows the push, 0 for each that follows motion"
+    )
     slip: SlipConstraintParameters = dataclasses.field(default_factory=SlipConstraintParameters)
 
-    def __post_init__(self) -> None:
-        """Check the parameters.
-
-        Raises:
-            ControlError: names the field, its value and what is allowed.
-        """
-        super().__post_init__()
-        if len(self.force_controlled) != 3 or any(value not in (0.0, 1.0) for value in self.force_controlled):
-            raise ControlError(
-                f"force_controlled = {self.force_controlled!r} is not allowed; allowed: 0 or 1 for each of x, y, yaw"
-            )
+    @classmethod
+    def of_robot(cls, robot: RobotDescription, delay: float = DELAY) -> Self:
+        """Return the gains of a robot; k_v closes the same loop as k_d does, so it is the same number."""
+        plain = super().of_robot(robot, delay)
+        return dataclasses.replace(plain, tracking_gain=plain.velocity_gain)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +150,7 @@ class UnifiedForceMotion(ComputedTorque):
     _state_type: type[Any] = ForceGuidedState
 
     def __init__(self, robot: RobotDescription, parameters: ForceGuidedParameters | None = None) -> None:
-        p = parameters or ForceGuidedParameters()
+        p = parameters or ForceGuidedParameters.of_robot(robot)
         super().__init__(robot, p)
         # Wheels ahead: the robot's own inertia hardly depends on how they stand.
         own, _ = self._model.evaluate(np.zeros(robot.n), np.zeros(3))
@@ -193,10 +190,9 @@ class UnifiedForceMotion(ComputedTorque):
             before.guided_twist, before.impulse, before.energy, push, wanted, V, known, self.virtual_mass, self._follows,
             self._numbers, demand.A, self._B_inverse, self._speed_limit, dt,
         )  # fmt: skip
-        _, theta = self._model.evaluate(demand.steer_angle, V)
         F_u, followed = _unified_force(
-            demand.wrench, demand.inertia, theta, push, V, V_f, before.guided_twist, state.reference_twist, self._follows,
-            self._largest_change, self.parameters.tracking_gain, dt,
+            demand.wrench, demand.inertia, demand.bias, push, V, V_f, before.guided_twist, state.reference_twist,
+            self._follows, self._largest_change, self.parameters.tracking_gain, dt,
         )  # fmt: skip
         state = dataclasses.replace(
             before, reference_twist=followed,
@@ -220,7 +216,7 @@ class ForceGuided(SlipConstraintForce, UnifiedForceMotion):
     _state_type: type[Any] = SlipHoldingGuidedState
 
     def __init__(self, robot: RobotDescription, parameters: ForceGuidedParameters | None = None) -> None:
-        super().__init__(robot, parameters or ForceGuidedParameters())  # type: ignore[arg-type]
+        super().__init__(robot, parameters or ForceGuidedParameters.of_robot(robot))  # type: ignore[arg-type]
 
 
 @compiled
@@ -305,7 +301,7 @@ def _give_way(  # type: ignore[no-untyped-def]
             if abs(found[i]) < 1e-3:
                 found[i] = 0.0
     shrink = max(1.0, math.hypot(found[0], found[1]) / speed_limit, abs(found[2]) / yaw_limit)
-    shrink = max(shrink, _largest_joint_speed(A, found, B_inverse, joint_speed_limit))
+    shrink = max(shrink, largest_joint_speed_kernel(A, found, B_inverse, joint_speed_limit))
     if shrink > 1.0:
         found /= shrink
         guard = max(guard, _SPEED)

@@ -15,6 +15,8 @@ Three ways to do it, each a controller; the pseudo-inverse through A gives every
 * `JacobianPseudoInverse`: the least joint torques, through J = B^-1 A (fig. 5.7); it asks nothing of the ground, and is here
   to be compared with, as is `BasicSolution`: three forces carry everything.
 
+When a twist is followed, the reference moves no faster than a part of the friction carries it (`ground_share`).
+
 mu comes from the measurement (`friction`), or is that of the robot's ground; F_z is the robot's weight with the load that
 its own acceleration shifts, unless it is measured.
 """
@@ -22,30 +24,43 @@ its own acceleration shifts, unless it is measured.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import ClassVar
 
 import numpy as np
 
+from pcw_description.compiled import compiled
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 
 from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
 from .controller_interface import ControllerMeasurement, parameter
 from .force_distribution import (
+    LEAST_LIMIT,
     basic_forces,
     friction_optimal_forces,
     jacobian_forces,
     limited_forces_kernel,
     solve_kernel,
     weighted_forces,
+    weighted_forces_kernel,
 )
+from .friction_budget import GROUND_SHARE
 from .wheel_loads import WheelLoads
 
 
 @dataclasses.dataclass(frozen=True)
 class FrictionParameters(ComputedTorqueParameters):
-    """Gains and limits of a controller that looks at the ground."""
+    """Gains and limits of a controller that looks at the ground.
+
+    Attributes:
+        ground_share: part of the friction that the reference may need when a twist is followed, see `friction_budget` [1].
+    """
 
     uses: ClassVar[frozenset[str]] = frozenset({"friction"})
+
+    ground_share: float = parameter(
+        GROUND_SHARE, "1", "part of the friction that a reference may need", above=0.0, maximum=1.0
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +95,22 @@ class BasicSolution(ComputedTorque):
 
 
 class _OnGround(ComputedTorque):
-    """A controller that knows what its wheels hold."""
+    """A controller that knows what its wheels hold, and whose reference waits where they do not hold enough."""
+
+    parameters: FrictionParameters
 
     def __init__(self, robot: RobotDescription, parameters: ComputedTorqueParameters | None = None) -> None:
-        super().__init__(robot, parameters or FrictionParameters())
+        super().__init__(robot, parameters or FrictionParameters.of_robot(robot))
         self._loads = WheelLoads(robot)
+
+    def _carried(
+        self, V_d: FloatArray, V_dot_d: FloatArray, A: FloatArray, steer_angle: FloatArray, measurement: ControllerMeasurement
+    ) -> float:
+        """Return share / use where the wanted change needs more of the friction than the share, by the weighted forces."""
+        inertia, _ = self._model.evaluate(steer_angle, V_d)
+        limit = self._loads.traction_limit(steer_angle, V_dot_d, measurement.friction, measurement.normal_force)
+        use = _use_by_weights(A, inertia @ V_dot_d, limit)
+        return min(self.parameters.ground_share / max(use, 1e-12), 1.0)
 
     def _traction_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
         """Return mu F_z (n, 2) [N] at the acceleration that the demand asks for."""
@@ -92,6 +118,22 @@ class _OnGround(ComputedTorque):
         return self._loads.traction_limit(
             demand.steer_angle, acceleration, measurement.friction, measurement.normal_force
         )
+
+
+@compiled
+def _use_by_weights(A, wrench, limit):  # type: ignore[no-untyped-def]
+    """Return the largest |F_i| / limit_i of the weighted forces, at most 11 % above the least there is; in every cycle."""
+    n = len(limit)
+    weight = np.empty(2 * n)
+    for i in range(n):
+        for j in range(2):
+            weight[2 * i + j] = max(limit[i, j], LEAST_LIMIT) ** 2
+    force = weighted_forces_kernel(A, wrench, weight)
+    largest = 0.0
+    for i in range(n):
+        along, across = force[i, 0] / max(limit[i, 0], LEAST_LIMIT), force[i, 1] / max(limit[i, 1], LEAST_LIMIT)
+        largest = max(largest, math.hypot(along, across))
+    return largest
 
 
 class WeightedPseudoInverse(_OnGround):
@@ -119,7 +161,7 @@ class TractionLimitAvoidance(_OnGround):
     parameters: TractionLimitParameters
 
     def __init__(self, robot: RobotDescription, parameters: TractionLimitParameters | None = None) -> None:
-        super().__init__(robot, parameters or TractionLimitParameters())
+        super().__init__(robot, parameters or TractionLimitParameters.of_robot(robot))
         # |r F_x| and |b_y F_x - b_x F_y| within the torque limits, as a box: across gets what the worst along leaves.
         along = robot.torque_limit[:, DRIVE] / robot.wheel_radius
         offset = np.abs(robot.caster_offset)

@@ -186,7 +186,10 @@ def _shortest_duration(start: TrajectoryPoint, goal: TrajectoryPoint, limits: Mo
 
     The allowed durations need not reach to infinity: an acceleration at an end makes a long quintic swing out far.
     """
-    short = long = 1e-3
+    # No motion is shorter than its distance at full speed.
+    distance = goal.pose - start.pose
+    fastest = max(math.hypot(distance[0], distance[1]) / limits.speed, abs(distance[2]) / limits.yaw_rate)
+    short = long = max(1e-3, (1.0 - 1e-9) * fastest)
     while not _within(start, goal, long, limits):
         short, long = long, 1.1 * long
         if long > _LONGEST_DURATION:

@@ -90,21 +90,21 @@ def _towards(  # type: ignore[no-untyped-def]
     reference, target, A, B_inverse, speed_limit, offset, fraction, alpha, dt, speed, acceleration, yaw_rate, yaw_acceleration
 ):
     wanted = target * _shrink(target, speed, yaw_rate)
-    wanted = wanted / max(1.0, _largest_joint_speed(A, wanted, B_inverse, speed_limit))
+    wanted = wanted / max(1.0, largest_joint_speed_kernel(A, wanted, B_inverse, speed_limit))
     wanted = wanted / max(1.0, _hardest_turn(A, wanted, offset, alpha))
     change = wanted - reference
     change = change * _shrink(change, acceleration * dt, yaw_acceleration * dt)
     V_d = reference + change
     # A caster may turn round in less time than the deceleration allows; then the limit of the joint comes first.
-    V_d = V_d / max(1.0, _largest_joint_speed(A, V_d, B_inverse, speed_limit) * fraction)
+    V_d = V_d / max(1.0, largest_joint_speed_kernel(A, V_d, B_inverse, speed_limit) * fraction)
     change = V_d - reference
     V_dot_d = change / dt * _shrink(change, acceleration * dt, yaw_acceleration * dt)
     return V_d, V_dot_d
 
 
 @compiled
-def _largest_joint_speed(A, twist, B_inverse, speed_limit):  # type: ignore[no-untyped-def]
-    """Return the largest of the joint speeds B^-1 A V relative to their limits (n, 2)."""
+def largest_joint_speed_kernel(A, twist, B_inverse, speed_limit):  # type: ignore[no-untyped-def]
+    """Return the largest of the joint speeds B^-1 A V relative to their limits (n, 2) [1]; one call in a control cycle."""
     largest = 0.0
     for i in range(len(B_inverse)):
         along = A[2 * i, 0] * twist[0] + A[2 * i, 1] * twist[1] + A[2 * i, 2] * twist[2]

@@ -41,14 +41,14 @@ from .controller_interface import (
     Reference,
     TwistReference,
     check_step,
+    choice,
     internal_force_kernel,
+    joint_torque_kernel,
     parameter,
 )
-from .delay_margin import derived_bandwidth, effective_mass, own_mass, tyre_resonance
+from .delay_margin import BANDWIDTH, derived_bandwidth, effective_mass, own_mass, tyre_resonance
 from .errors import ControlError
 from .reference_motion import MotionParameters, ReferenceMotion
-
-BANDWIDTH = 10.0  # w where delay allows it [rad/s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,17 +85,7 @@ class SlidingModeRateParameters(ResolvedMotionRateParameters):
     disturbance: float = parameter(3.0, "m/s^2", "acceleration of a disturbance that can be made up for", maximum=100.0)
     filter_time: float = parameter(0.05, "s", "of the low-pass filter", above=0.0, maximum=1.0)
     boundary: float = parameter(0.05, "m/s", "half the width of the boundary layer", above=0.0, maximum=1.0)
-    law: str = dataclasses.field(default="low_pass_integral", metadata={"choices": sliding_mode.SLIDING_LAWS})
-
-    def __post_init__(self) -> None:
-        """Check the parameters.
-
-        Raises:
-            ControlError: names the field, its value and what is allowed.
-        """
-        super().__post_init__()
-        if self.law not in sliding_mode.SLIDING_LAWS:
-            raise ControlError(f"law {self.law!r} is not allowed; allowed: {', '.join(sliding_mode.SLIDING_LAWS)}")
+    law: str = choice("low_pass_integral", sliding_mode.SLIDING_LAWS, "the sliding law")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +130,7 @@ class ResolvedMotionRate:
         self._geometry = (robot.steer_axis, robot.caster_offset)
         self._radius = robot.wheel_radius
         self._B = joint_matrix_blocks(robot)
+        self._B_transposed = np.ascontiguousarray(self._B.transpose(0, 2, 1))
         self._reference_motion = ReferenceMotion(robot, self.parameters)
         self._mass = effective_mass(robot)
         w = self.bandwidth = self.parameters.bandwidth or derived_bandwidth(robot, BANDWIDTH)
@@ -176,7 +167,8 @@ class ResolvedMotionRate:
         A = wheel_jacobian_kernel(*self._geometry, steer_angle)
         V, incompatibility, _ = forward_kinematics_kernel(*self._geometry, self._radius, steer_angle, joint_velocity)
         V_d, wanted = self._wanted(state, measurement, reference, A, dt)
-        moved = np.einsum("nij,nj->ni", self._B, joint_velocity)
+        # B q_dot is B^T of the transposed blocks.
+        moved = joint_torque_kernel(self._B_transposed, joint_velocity)
         if self.parameters.slip_share > 0.0 and measurement.slip is not None:
             slip = measurement.slip if measurement.slip_valid is None else measurement.slip * measurement.slip_valid
             moved = moved - self.parameters.slip_share * slip
@@ -186,7 +178,7 @@ class ResolvedMotionRate:
             integral = np.clip(integral + e * dt, -self._largest_integral, self._largest_integral)
         u_c = self._k_p * e + self._k_i * integral + self._coupling(A, e, integral)
         sliding, u = self._discontinuous(state.sliding, e, u_c, measurement.saturated, dt)
-        tau = np.einsum("nji,nj->ni", self._B, u)
+        tau = joint_torque_kernel(self._B, u)
         internal = internal_force_kernel(*self._geometry, steer_angle, u)
         state = ResolvedMotionRateState(V_d, integral, sliding)
         return state, ControllerOutput(tau, u, A.T @ u.ravel(), V, V_d, internal)

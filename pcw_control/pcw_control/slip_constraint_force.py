@@ -237,7 +237,7 @@ class SlipConstraintForce(ComputedTorque):
     _state_type: type[Any] = SlipConstraintForceState
 
     def __init__(self, robot: RobotDescription, parameters: SlipConstraintForceParameters | None = None) -> None:
-        p = parameters or SlipConstraintForceParameters()
+        p = parameters or SlipConstraintForceParameters.of_robot(robot)
         super().__init__(robot, p)
         self.law = SlipConstraintLaw(robot, p.slip)
 
@@ -273,4 +273,4 @@ class FrictionOptimalSlipConstraint(SlipConstraintForce, FrictionOptimal):
     def __init__(
         self, robot: RobotDescription, parameters: FrictionOptimalSlipConstraintParameters | None = None
     ) -> None:
-        super().__init__(robot, parameters or FrictionOptimalSlipConstraintParameters())
+        super().__init__(robot, parameters or FrictionOptimalSlipConstraintParameters.of_robot(robot))

@@ -30,6 +30,7 @@ from .controller_interface import (
     ControllerParameters,
     Reference,
     internal_force_kernel,
+    joint_torque_kernel,
     parameter,
 )
 from .slip_constraint_force import (
@@ -81,7 +82,7 @@ class SlipRatioLimit(SlipConstraintForce):
     parameters: SlipRatioLimitParameters
 
     def __init__(self, robot: RobotDescription, parameters: SlipRatioLimitParameters | None = None) -> None:
-        p = parameters or SlipRatioLimitParameters()
+        p = parameters or SlipRatioLimitParameters.of_robot(robot)
         super().__init__(robot, p)
         self._wheels = np.array([SlidingWheel.of_robot(robot, i).numbers() for i in range(robot.n)])
         control = p.ratio.control
@@ -120,7 +121,7 @@ class SlipRatioLimit(SlipConstraintForce):
         torque = output.torque.copy()
         torque[:, DRIVE] = drive
         # tau = B^T F once more, so that what is said of forces is true.
-        force = np.einsum("nji,nj->ni", self._to_force, torque)
+        force = joint_torque_kernel(self._to_force, torque)
         steer_angle = np.ascontiguousarray(measurement.joint_position[:, 1])
         internal = internal_force_kernel(*self._geometry, steer_angle, force)
         return state, dataclasses.replace(output, torque=torque, contact_force=force, internal_force=internal)

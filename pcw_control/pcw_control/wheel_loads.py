@@ -23,6 +23,7 @@ class WheelLoads:
         self._module = np.array([[c.module.mass, *c.module.com, c.wheel_radius] for c in modules])
         self._geometry = (robot.steer_axis, robot.caster_offset)
         self._mu = np.array([[tyre.mu_p, tyre.lateral.mu_p] for tyre in robot.tyres])
+        self._mu_along = np.ascontiguousarray(self._mu[:, 0])
 
     def normal_force(self, steer_angle: FloatArray, acceleration: FloatArray) -> FloatArray:
         """Return F_z (n,) [N].
@@ -50,9 +51,18 @@ class WheelLoads:
             normal_force: measured loads (n,) [N]; None computes them.
         """
         load = self.normal_force(steer_angle, acceleration) if normal_force is None else normal_force
-        # An estimate of friction is of the ground: along and across keep the ratio that the tyre has.
-        mu = self._mu if friction is None else self._mu * (friction / self._mu[:, 0])[:, None]
-        return mu * load[:, None]
+        limit: FloatArray = _limits(self._mu, self._mu_along if friction is None else friction, load)
+        return limit
+
+
+@compiled
+def _limits(mu, friction, load):  # type: ignore[no-untyped-def]
+    """Return mu F_z (n, 2); an estimate of friction is of the ground: along and across keep the ratio that the tyre has."""
+    limit = np.empty(mu.shape)
+    for i in range(len(load)):
+        for j in range(2):
+            limit[i, j] = mu[i, j] * (friction[i] / mu[i, 0]) * load[i]
+    return limit
 
 
 @compiled

@@ -6,8 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcw_control import CONTROLLERS, ControllerMeasurement, ForceReference, TwistReference, make_controller
-from pcw_control.controller_interface import ControllerParameters
+from pcw_control import (
+    CONTROLLERS,
+    ComputedTorqueParameters,
+    ControlError,
+    ControllerMeasurement,
+    ForceReference,
+    TwistReference,
+    make_controller,
+)
+from pcw_control.controller_interface import ControllerParameters, settable_fields, with_values
+from pcw_control.delay_margin import DELAY, delay_margin, effective_mass
+from pcw_control.slip_ratio_limit import SlipRatioLimitParameters
 from pcw_description import load_robot
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -44,6 +54,33 @@ def test_the_readme_tells_of_every_controller_and_every_parameter():
     text = README.read_text(encoding="utf-8")
     for name, entry in CONTROLLERS.items():
         assert f"| `{name}` | {entry.summary} |" in text
-        for field in dataclasses.fields(entry.parameters):
-            if field.metadata:
-                assert f"| `{field.name}` |" in text or f"| `{name}.{field.name}` |" in text, field.name
+        for path, _, _ in settable_fields(entry.parameters()):
+            assert f"| `{path}` |" in text or f"| `{name}.{path}` |" in text, path
+
+
+def test_values_go_by_name_into_parameters_within_parameters_and_are_checked_there():
+    parameters = SlipRatioLimitParameters()
+    names = {path: value for path, _, value in settable_fields(parameters)}
+    assert names["slip.loop_delay"] == 0.002 and names["ratio.control.least_speed"] == 0.3
+    assert with_values(parameters, names.__getitem__) == parameters
+    names |= {"slip.loop_delay": 0.004, "ratio.control.gain": 30.0, "integral_limit": [0.5, 0.5, 1.0]}
+    changed = with_values(parameters, names.__getitem__)
+    assert changed.slip.loop_delay == 0.004 and changed.ratio.control.gain == 30.0
+    assert changed.integral_limit == (0.5, 0.5, 1.0) and changed.slip.integral_ratio == parameters.slip.integral_ratio
+    for path, bad in (("slip.loop_delay", -1.0), ("integral_limit", [1.0, 1.0]), ("ratio.share", 0.0)):
+        with pytest.raises(ControlError, match=path.rpartition(".")[2]):
+            with_values(parameters, (names | {path: bad}).__getitem__)
+
+
+@pytest.mark.parametrize("name", sorted(CONTROLLERS))
+@pytest.mark.parametrize("robot_name", ["thesis", "tidybot2", "xr4000", "dyros_pcv", "flow_base"])
+def test_a_controller_that_is_given_no_gains_has_those_that_its_robot_bears(name, robot_name):
+    """A user who names a robot gets the robot's gains; computed torque at 20 1/s was more than two of the robots bear."""
+    robot = load_robot(robot_name)
+    p = make_controller(name, robot).parameters
+    assert p == CONTROLLERS[name].parameters.of_robot(robot)
+    if isinstance(p, ComputedTorqueParameters):
+        gain = max(p.velocity_gain, getattr(p, "tracking_gain", 0.0))
+        assert delay_margin(robot, gain * effective_mass(robot)).min() >= DELAY * (1.0 - 1e-9)
+        # Both poles of e_ddot + k_d e_dot + k_p e = 0 in one place.
+        assert p.velocity_gain**2 == pytest.approx(4.0 * p.position_gain)

@@ -80,5 +80,8 @@ def test_the_command_says_what_is_left_and_its_exit_code_what_is_borne(capsys, t
     assert (tmp_path / "thesis.yaml").exists()
     assert gain_check.main(["thesis", "--velocity-gain", "150"]) == 1
     assert "does not bear" in capsys.readouterr().out
+    assert gain_check.main([]) == 0  # what is derived is borne, by every shipped robot
+    assert "does not bear" not in capsys.readouterr().out
+    assert gain_check.main(["tidybot2", "--velocity-gain", "20"]) == 1
     assert gain_check.main(["no_such_robot"]) == 2
     assert gain_check.main(["thesis", "--delay", "nan"]) == 2

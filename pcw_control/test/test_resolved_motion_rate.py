@@ -155,5 +155,5 @@ def test_parameters_are_refused_with_what_is_allowed():
         ResolvedMotionRateParameters(slip_share=1.5)
     with pytest.raises(ControlError, match="filter_time = 0.0 is not allowed"):
         SlidingModeRateParameters(filter_time=0.0)
-    with pytest.raises(ControlError, match="law 'soft' is not allowed; allowed: boundary_layer, low_pass_integral, plain"):
+    with pytest.raises(ControlError, match="law = 'soft' is not allowed; allowed: boundary_layer, low_pass_integral, plain"):
         SlidingModeRateParameters(law="soft")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
+import math
 from collections.abc import Iterable
 
 # A value longer than this is cut in a message, a suggestion among more names than this does without their list.
@@ -36,6 +38,38 @@ class KinematicsError(PcwError):
 
 class RecordingError(PcwError):
     """A recording that cannot be written or read; the message names the path and a remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NumberChecks:
+    """Checks of numbers that a package raises its own error for.
+
+    Attributes:
+        error: the package's base error.
+    """
+
+    error: type[PcwError]
+
+    def number(
+        self, name: str, value: float, minimum: float = -math.inf, above: float = -math.inf, maximum: float = math.inf
+    ) -> None:
+        """Check a number.
+
+        Raises:
+            PcwError: as `error`; it is not finite or out of range.
+        """
+        if not (math.isfinite(value) and minimum <= value <= maximum and value > above):
+            lowest = f"above {above:g}" if above > -math.inf else f"at least {minimum:g}"
+            raise self.error(f"{name} = {value!r} is not allowed; allowed: {lowest}, at most {maximum:g}")
+
+    def time_step(self, dt: float) -> None:
+        """Check a measured time step [s].
+
+        Raises:
+            PcwError: as `error`; it is not positive and finite.
+        """
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise self.error(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

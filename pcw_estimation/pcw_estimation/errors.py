@@ -1,4 +1,4 @@
-"""The base exception of pcw_estimation, and the check of parameters that raises it."""
+"""The base exception of pcw_estimation, and the checks of numbers that raise it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import math
 from collections.abc import Collection
 from typing import Any
 
-from pcw_description.errors import PcwError
+from pcw_description.errors import NumberChecks, PcwError
 
 
 class EstimationError(PcwError):
     """An estimator's parameter or measurement that is not allowed; the message says what is."""
+
+
+_CHECKS = NumberChecks(EstimationError)
+require, require_dt = _CHECKS.number, _CHECKS.time_step
 
 
 def require_not_negative(parameters: Any, positive: Collection[str]) -> None:

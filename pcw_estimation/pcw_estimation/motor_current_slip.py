@@ -20,6 +20,7 @@ from pcw_description.contact.contact_model import slip_of_force, tyre_parameters
 from pcw_description.differential_kinematics import forward_kinematics_kernel, wheel_jacobian_kernel
 from pcw_description.robot_description import GRAVITY, STEER, FloatArray, RobotDescription
 
+from .errors import require, require_dt
 from .slip_estimate import (
     JointMeasurement,
     SlipEstimate,
@@ -28,8 +29,6 @@ from .slip_estimate import (
     WheelModel,
     ratio_of,
     ratios_and_angles,
-    require,
-    require_dt,
 )
 
 

@@ -35,6 +35,7 @@ from pcw_description.contact.contact_model import (
 from pcw_description.differential_kinematics import wheel_jacobian_kernel
 from pcw_description.robot_description import GRAVITY, FloatArray, RobotDescription
 
+from .errors import require_dt
 from .low_root_trust import (
     EXPLAINED_FLOOR,
     EXPLAINED_SHARE,
@@ -65,7 +66,7 @@ from .sliding_mode_observer import (
     load_that_follows,
     mass_contradicted,
 )
-from .slip_estimate import RATIO_SPEED, JointMeasurement, SlipEstimate, require_dt
+from .slip_estimate import RATIO_SPEED, JointMeasurement, SlipEstimate
 from .slipping_robot_dynamics import (
     CX,
     CY,

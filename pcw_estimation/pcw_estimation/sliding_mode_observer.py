@@ -31,7 +31,7 @@ from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import LAMBDA, MU, friction_coefficient, slip_of_force
 from pcw_description.robot_description import FloatArray
 
-from .errors import EstimationError
+from .errors import EstimationError, require, require_dt
 from .joint_sliding_mode import from_angle, from_speed
 from .low_root_trust import (
     EXPLAINED_FLOOR,
@@ -45,7 +45,7 @@ from .low_root_trust import (
     trust_of_root,
     velocity_of_slip,
 )
-from .slip_estimate import WheelEstimate, WheelMeasurement, WheelModel, ratio_of, require, require_dt
+from .slip_estimate import WheelEstimate, WheelMeasurement, WheelModel, ratio_of
 
 MEASURED = ("speed", "angle")
 # A learned mass forgets over this time [s], and begins to count from this much squared acceleration [m^2/s^3].

@@ -16,7 +16,7 @@ from pcw_description.contact.contact_model import tyre_parameters
 from pcw_description.robot_description import ContactDescription, FloatArray, RobotDescription
 from pcw_description.wheel_dynamics import slip_ratio
 
-from .errors import EstimationError
+from .errors import EstimationError, require
 
 # Slip ratio and slip angle refer to at least this speed, below which they are noise [m/s].
 RATIO_SPEED = 0.05
@@ -174,24 +174,3 @@ def ratios_and_angles(sensed: FloatArray, velocity: FloatArray) -> FloatArray:
     reference = np.maximum(np.maximum(np.abs(sensed[:, 0]), np.abs(velocity[:, 0])), RATIO_SPEED)
     slip = sensed - velocity
     return np.stack([slip[:, 0] / reference, np.arctan2(slip[:, 1], reference)], axis=1)
-
-
-def require(name: str, value: float, minimum: float = -math.inf, above: float = -math.inf, maximum: float = math.inf) -> None:
-    """Check a number.
-
-    Raises:
-        EstimationError: it is not finite or out of range.
-    """
-    if not (math.isfinite(value) and minimum <= value <= maximum and value > above):
-        lowest = f"above {above:g}" if above > -math.inf else f"at least {minimum:g}"
-        raise EstimationError(f"{name} = {value!r} is not allowed; allowed: {lowest}, at most {maximum:g}")
-
-
-def require_dt(dt: float) -> None:
-    """Check a measured time step.
-
-    Raises:
-        EstimationError: it is not positive and finite.
-    """
-    if not (math.isfinite(dt) and dt > 0.0):
-        raise EstimationError(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")

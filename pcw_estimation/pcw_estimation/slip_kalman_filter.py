@@ -25,6 +25,7 @@ from pcw_description.contact.contact_model import friction_coefficient
 from pcw_description.differential_kinematics import forward_kinematics_kernel, wheel_jacobian_kernel
 from pcw_description.robot_description import GRAVITY, FloatArray, RobotDescription
 
+from .errors import require, require_dt
 from .slip_estimate import (
     RATIO_SPEED,
     JointMeasurement,
@@ -34,8 +35,6 @@ from .slip_estimate import (
     WheelModel,
     ratio_of,
     ratios_and_angles,
-    require,
-    require_dt,
 )
 from .slipping_robot_dynamics import (
     CX,

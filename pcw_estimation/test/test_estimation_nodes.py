@@ -156,8 +156,9 @@ def test_slip_names_the_wheel_and_never_sends_what_it_does_not_know(ros):
     assert np.median(np.diff([stamp_to_ns(m.header.stamp) for m in slip])) == 10e6
 
     robot.extra_velocity[1, 0] = 0.4 / 0.075
-    robot.run(lambda: "front_right_longitudinal" in messages_of(diagnostics))
-    assert slip[-1].velocity[2] == max(slip[-1].velocity) > 0.1
+    # Which of the two topics arrives first is nobody's promise.
+    robot.run(lambda: "front_right_longitudinal" in messages_of(diagnostics) and max(slip[-1].velocity) > 0.1)
+    assert slip[-1].velocity[2] == max(slip[-1].velocity)
     assert slip[-1].position[2] > 0.1
     robot.extra_velocity[1, 0] = 0.0
     diagnostics.clear()

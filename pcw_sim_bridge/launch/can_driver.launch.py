@@ -15,9 +15,9 @@ from launch_ros.parameter_descriptions import ParameterValue
 ARGUMENTS = (
     ("robot", "thesis", "a .yaml file or a shipped robot"),
     ("can_file", "thesis_cia402", "file of the drives, or the name of a shipped one"),
-    ("autostart", "false", "configure and activate at once"),
+    ("autostart", "false", "configure and activate once the drives answer"),
     ("emulate", "false", "start the emulated drives too, on UDP multicast"),
-    ("udp_port", "43113", "port of the emulated buses"),
+    ("udp_port", "28850", "port of the emulated buses"),
 )
 
 

@@ -58,6 +58,7 @@ def run_closed_loop(
     limited: bool = True,
     measure: Callable[[ControllerMeasurement], ControllerMeasurement] | None = None,
     lifted: bool = False,
+    observe: Callable[[JointReading, float], None] | None = None,
 ) -> ClosedLoopRun:
     """Drive a robot on a plant.
 
@@ -72,6 +73,7 @@ def run_closed_loop(
         limited: whether the torques pass the torque limits.
         measure: what else the controller is told, added to a measurement.
         lifted: on a jack, the wheels off the ground.
+        observe: what looks on: it is given every reading of the joints and the time since the last [s], before `measure`.
     """
     simulated = SimulatedRobot(make_plant(plant, robot, lifted=lifted), seed)
     if steer_angle is not None:
@@ -87,6 +89,8 @@ def run_closed_loop(
             dt = (simulated.time_ns - before) * 1e-9 if before >= 0 else simulated.control_period
             before, now = simulated.time_ns, simulated.time_ns * 1e-9
             odometry, _ = update(believed, parameters, odometry, reading.position, dt)
+            if observe is not None:
+                observe(reading, dt)
             measured = ControllerMeasurement(reading.position, reading.velocity, odometry.pose, saturated)
             if measure is not None:
                 measured = measure(measured)

@@ -1,6 +1,6 @@
 """Random runs of every controller on robots that are not as it believes: is anything unstable?
 
-    python -m pcw_sim_bridge.controller_robustness [--runs 200] [--first 0] [--out pcw_control/docs/controller_robustness.md]
+    python -m pcw_sim_bridge.controller_robustness [--runs 200] [--pybullet-runs 60] [--first 0] [--out FILE]
 
 Every run draws from its seed a robot (six kinds, three to six casters), a controller, headings of the wheels, three twists to
 follow, and errors of up to 20 % in every mass, inertia and friction coefficient. The plant has 1 ms of dead time in the
@@ -40,13 +40,14 @@ class Outcome:
     """One run.
 
     Attributes:
-        robot, controller: what was drawn.
+        plant, robot, controller: what was drawn, and where.
         casters: how many.
         error: RMS of the twist error at the end, over what is allowed.
         ripple: standard deviation of the torques at the end, over their limits, the largest.
         slip: RMS of the true slip at the end [m/s].
     """
 
+    plant: str
     robot: str
     controller: str
     casters: int
@@ -144,7 +145,7 @@ def random_run(seed: int, plant: str = "reduced", names: Sequence[str] = tuple(C
     allowed = np.maximum(0.05, 0.1 * np.abs(target))
     ripple = float(np.max(run.torque[end].std(axis=0) / robot.torque_limit))
     return Outcome(
-        robot.name, name, robot.n, float(np.max(error / allowed)), ripple, float(np.sqrt(np.mean(run.slip[end] ** 2)))
+        plant, robot.name, name, robot.n, float(np.max(error / allowed)), ripple, float(np.sqrt(np.mean(run.slip[end] ** 2)))
     )
 
 
@@ -153,29 +154,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="controller_robustness", description="Random runs of every controller.")
     parser.add_argument("--runs", type=int, default=200, help="how many (default: %(default)s)")
     parser.add_argument("--first", type=int, default=0, help="first seed (default: %(default)s)")
-    parser.add_argument("--plant", default="reduced", help="plant (default: %(default)s)")
+    parser.add_argument(
+        "--pybullet-runs", type=int, default=60, help="how many of these in PyBullet as well (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, default=Path("pcw_control/docs/controller_robustness.md"), help="file to write")
     options = parser.parse_args(arguments)
     if options.runs < 1:
         parser.error(f"argument --runs: {options.runs} is not allowed; allowed: at least 1")
     outcomes = []
-    for seed in range(options.first, options.first + options.runs):
-        outcomes.append(random_run(seed, options.plant))
-        print(seed, outcomes[-1], "UNSTABLE" if outcomes[-1].unstable else "", flush=True)
+    for plant, runs in (("reduced", options.runs), ("pybullet", min(options.pybullet_runs, options.runs))):
+        for seed in range(options.first, options.first + runs):
+            outcomes.append(random_run(seed, plant))
+            print(seed, outcomes[-1], "UNSTABLE" if outcomes[-1].unstable else "", flush=True)
     lines = [
         "# Random runs of every controller", "",
-        f"Written by `python -m pcw_sim_bridge.controller_robustness --runs {options.runs} --first {options.first} --plant "
-        f"{options.plant}`; nothing here is typed in.", "",
+        f"Written by `python -m pcw_sim_bridge.controller_robustness --runs {options.runs} --pybullet-runs "
+        f"{options.pybullet_runs} --first {options.first}`; nothing here is typed in.", "",
         f"Masses, inertias and friction off by up to {ERROR:.0%}, {1e3 * DEAD_TIME:g} ms of dead time, robots of three to six "
         "casters from random headings. Error: of the twist at the end, over what is allowed. Ripple: of the torques at the "
         "end, over their limits. Slip: RMS at the end.", "",
-        "| controller | runs | unstable | largest error | largest ripple | slip, median |", "|---|---|---|---|---|---|",
+        "| plant | controller | runs | unstable | largest error | largest ripple | slip, median |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for name in CONTROLLERS:
-        of = [outcome for outcome in outcomes if outcome.controller == name]
+    for plant, name in dict.fromkeys((outcome.plant, name) for outcome in outcomes for name in CONTROLLERS):
+        of = [outcome for outcome in outcomes if (outcome.plant, outcome.controller) == (plant, name)]
         if of:
             lines.append(
-                f"| `{name}` | {len(of)} | {sum(o.unstable for o in of)} | {max(o.error for o in of):.2f} | "
+                f"| {plant} | `{name}` | {len(of)} | {sum(o.unstable for o in of)} | {max(o.error for o in of):.2f} | "
                 f"{max(o.ripple for o in of):.1%} | {1e3 * float(np.median([o.slip for o in of])):.1f} mm/s |"
             )
     unstable = [outcome for outcome in outcomes if outcome.unstable]

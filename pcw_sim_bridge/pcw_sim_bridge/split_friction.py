@@ -9,27 +9,31 @@ drawn from the seed. Torques take effect 2 ms late, and slip is known from encod
 
 Each below and beyond the traction limit, which is where the pseudo-inverse asks the worst wheel for all that it holds:
 the peak acceleration is a part of that limit. On uniform ground "beyond" is but a little beyond, since nothing that
-shares forces can help where all wheels are at their limits.
+shares forces can help where all wheels are at their limits; "far beyond" asks there for what the others ask for.
+
+Methods that are paced take the same path at the pace at which a part of the friction carries them (`friction_budget`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pcw_control.computed_torque import ComputedTorque, ComputedTorqueState, Demand
 from pcw_control.controller_interface import Controller, ControllerMeasurement
 from pcw_control.controllers import make_controller
+from pcw_control.friction_budget import FrictionBudget, plan_within_friction
 from pcw_control.friction_sharing import FrictionParameters
 from pcw_control.quintic_trajectory import (
     REST_PEAK_ACCELERATION,
     REST_PEAK_SPEED,
+    MotionLimits,
     QuinticTrajectory,
     TrajectoryPoint,
-    quintic_coefficients,
+    plan_point_to_point,
 )
 from pcw_control.wheel_loads import WheelLoads
 from pcw_description.augmented_object_model import AugmentedObjectModel
@@ -50,11 +54,12 @@ CASES = ("split", "uniform", "off_centre")
 # there is to reduce; on uniform ground the wheels reach it nearly together.
 LEVELS: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "split": {"beyond": (1.5, 2.4), "below": (0.6, 0.85)},
-    "uniform": {"beyond": (1.0, 1.1), "below": (0.6, 0.85)},
+    "uniform": {"far beyond": (1.5, 2.4), "beyond": (1.0, 1.1), "below": (0.6, 0.85)},
     "off_centre": {"beyond": (1.4, 1.8), "below": (0.6, 0.85)},
 }
 # Distance of the load from the middle as part of the reach of the wheels.
 OFF_CENTRE = 0.3
+_REST = TrajectoryPoint(np.zeros(3))
 
 
 class ClippedForces(ComputedTorque):
@@ -82,10 +87,12 @@ class Method:
     Attributes:
         controller: its name in the registry; "clip" is `ClippedForces`.
         told: whether it is told friction and load under every wheel, within TOLD_WITHIN.
+        paced: whether its trajectory needs no more than a part of the friction that it is told.
     """
 
     controller: str
     told: bool = False
+    paced: bool = False
 
 
 METHODS: Mapping[str, Method] = {
@@ -96,6 +103,8 @@ METHODS: Mapping[str, Method] = {
     "QP": Method("friction_optimal", told=True),
     "QP + SCFC": Method("friction_optimal_slip_constraint", told=True),
     "QP + SCFC, not told": Method("friction_optimal_slip_constraint"),
+    "SCFC, paced": Method("slip_constraint_force", told=True, paced=True),
+    "QP + SCFC, paced": Method("friction_optimal_slip_constraint", told=True, paced=True),
 }
 
 
@@ -105,12 +114,15 @@ class Manoeuvre:
 
     Attributes:
         robot: as it really is.
-        trajectory: what it shall follow.
+        goal, limits: where it shall go, and how fast it may.
+        trajectory: the way there.
         steer_angle: headings at the start (n,) [rad].
         friction, normal_force: under each wheel, as far as a controller may be told (n,) [1], [N].
     """
 
     robot: RobotDescription
+    goal: TrajectoryPoint
+    limits: MotionLimits
     trajectory: QuinticTrajectory
     steer_angle: FloatArray
     friction: FloatArray
@@ -174,11 +186,11 @@ def draw_manoeuvre(robot: RobotDescription, case: str, level: str, seed: int) ->
     # A quintic's peaks: v = 15/8 d/T, a = 10/sqrt(3) d/T^2.
     duration = REST_PEAK_ACCELERATION / REST_PEAK_SPEED * SPEED / (factor * limit)
     goal = TrajectoryPoint(along * SPEED * duration / REST_PEAK_SPEED)
-    coefficients = quintic_coefficients(TrajectoryPoint(np.zeros(3)), goal, duration)
+    limits = MotionLimits(SPEED, factor * limit)
     error = 1.0 + rng.uniform(-TOLD_WITHIN, TOLD_WITHIN, (2, n))
     return Manoeuvre(
-        dataclasses.replace(robot, physics=tuple(physics)), QuinticTrajectory(coefficients, duration), steer_angle,
-        mu * error[0], loads * error[1],
+        dataclasses.replace(robot, physics=tuple(physics)), goal, limits, plan_point_to_point(_REST, goal, limits),
+        steer_angle, mu * error[0], loads * error[1],
     )  # fmt: skip
 
 
@@ -196,14 +208,25 @@ def controller_of(method: Method, robot: RobotDescription) -> Controller:
     return ClippedForces(robot) if method.controller == "clip" else make_controller(method.controller, robot)
 
 
+def way_of(robot: RobotDescription, manoeuvre: Manoeuvre, method: Method) -> QuinticTrajectory:
+    """Return the trajectory that a method follows; a paced one goes by what it is told of the ground."""
+    if not method.paced:
+        return manoeuvre.trajectory
+    budget = FrictionBudget(robot)
+    return plan_within_friction(
+        budget, _REST, manoeuvre.goal, manoeuvre.limits, friction=manoeuvre.friction, normal_force=manoeuvre.normal_force
+    )
+
+
 def drive(robot: RobotDescription, manoeuvre: Manoeuvre, method: Method, seed: int, plant: str = "reduced") -> ClosedLoopRun:
     """Run one method on one manoeuvre; `robot` is what the controller believes."""
+    trajectory = way_of(robot, manoeuvre, method)
 
     def tell(measured: ControllerMeasurement) -> ControllerMeasurement:
         return dataclasses.replace(measured, friction=manoeuvre.friction, normal_force=manoeuvre.normal_force)
 
     return run_closed_loop(
-        manoeuvre.robot, controller_of(method, robot), manoeuvre.trajectory.sample, manoeuvre.trajectory.duration + AFTER,
+        manoeuvre.robot, controller_of(method, robot), trajectory.sample, trajectory.duration + AFTER,
         plant, seed, manoeuvre.steer_angle, measure=tell if method.told else None,
     )  # fmt: skip
 
@@ -213,7 +236,13 @@ def slip_of_worst_wheel(run: ClosedLoopRun) -> float:
     return float(np.sqrt(np.mean(np.sum(run.slip**2, axis=2), axis=0).max()))
 
 
-def slip_by_method(robot: RobotDescription, case: str, level: str, seed: int, plant: str = "reduced") -> dict[str, float]:
-    """Return the slip of every method on the manoeuvre of a seed [m/s]."""
+def slip_by_method(
+    robot: RobotDescription, case: str, level: str, seed: int, plant: str = "reduced", methods: Sequence[str] = tuple(METHODS)
+) -> dict[str, tuple[float, float]]:
+    """Return the slip of methods on the manoeuvre of a seed [m/s], and how long it took [s]."""
     manoeuvre = draw_manoeuvre(robot, case, level, seed)
-    return {name: slip_of_worst_wheel(drive(robot, manoeuvre, method, seed, plant)) for name, method in METHODS.items()}
+    found: dict[str, tuple[float, float]] = {}
+    for name in methods:
+        run = drive(robot, manoeuvre, METHODS[name], seed, plant)
+        found[name] = slip_of_worst_wheel(run), float(run.time[-1]) - AFTER
+    return found

@@ -66,6 +66,8 @@ class ActiveRun:
         along, across: greatest distance of base_link from where it should be, on its line and beside it [m].
         yaw: greatest turn [rad].
         predicted_path: what had been predicted of one test [m].
+        trace: time [s], errors of the pose along, across [m] and in yaw [rad], and the caster under test or -1, from the
+            request on (T, 5).
     """
 
     mu_p: FloatArray
@@ -78,6 +80,7 @@ class ActiveRun:
     across: float
     yaw: float
     predicted_path: float
+    trace: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 5)), repr=False)
 
 
 def line(now: float, heading: float) -> TrajectoryPoint:
@@ -161,14 +164,16 @@ def active_run(
             testing, requested = active.request(testing), True
             predicted = active.predict(reading.position[:, STEER], 0, loads).path
         under_test = output.testing if output is not None else -1
+        before_test = measurement
         if under_test >= 0:
-            record.add(measurement, reading.effort, dt)
             assert output is not None
             live, now_known = terrain.step_with_twist(
                 live, reading.position, velocity, reading.effort, output.twist, dt, np.arange(n) == under_test
             )
             measurement = _with_live(measurement, now_known, under_test)
         testing, output = active.step(testing, measurement, dt)
+        if under_test >= 0:
+            record.add(before_test, reading.effort, output.twist, dt)
         if under_test >= 0 and output.testing != under_test:
             odometry, live = _learn(record, under_test, knowledge, odometry), terrain.initial_state()
         odometry, _ = update(believed, odometry_parameters, odometry, output.controller_position, dt)
@@ -181,20 +186,22 @@ def active_run(
         limited = limit_torque(limits, torque, asked + output.torque, reading.velocity, dt)
         torque, saturated = limited.torque, limited.saturated
         simulated.command(JointCommand(effort=torque))
-        errors.append(np.array([now, *(simulated.plant.state().pose - point.pose)]))
+        errors.append(np.array([now, *(simulated.plant.state().pose - point.pose), output.testing]))
         if requested and testing.phase in (Phase.DONE, Phase.REFUSED):
             ended = ended or now
             if now > ended + AFTERWARDS:
                 break
     simulated.close()
     error = np.array(errors)
-    error = error[error[:, 0] >= REQUESTED] - np.array([0.0, *error[np.argmax(error[:, 0] >= REQUESTED), 1:]])
+    error = error[error[:, 0] >= REQUESTED]
+    error[:, 1:4] -= error[0, 1:4]
     c, s = np.cos(heading), np.sin(heading)
+    along, across = c * error[:, 1] + s * error[:, 2], c * error[:, 2] - s * error[:, 1]
+    error[:, 1], error[:, 2] = along, across
     return ActiveRun(
         knowledge.mu_p, knowledge.lambda_p, knowledge.covariance, knowledge.valid,
         (ended or LONGEST) - REQUESTED, testing.refusal.value,
-        float(np.abs(c * error[:, 1] + s * error[:, 2]).max()), float(np.abs(c * error[:, 2] - s * error[:, 1]).max()),
-        float(np.abs(error[:, 3]).max()), predicted,
+        float(np.abs(along).max()), float(np.abs(across).max()), float(np.abs(error[:, 3]).max()), predicted, error,
     )  # fmt: skip
 
 
@@ -271,13 +278,14 @@ def summarise(grounds: Sequence[tuple[float, float]], runs: Sequence[ActiveRun])
     )  # fmt: skip
 
 
-def document(plants: Sequence[str], seeds: int) -> str:
+def document(plants: Sequence[str], seeds: range) -> str:
     """Return the text of terrain_robot.md."""
     believed = load_robot(ROBOT)
     parts = [
         "# Terrain of whole robots",
         "",
-        f"Written by `python -m pcw_sim_bridge.terrain_study --seeds {seeds}`; nothing here is typed in.",
+        f"Written by `python -m pcw_sim_bridge.terrain_study --seeds {len(seeds)} --first-seed {seeds.start} --plants "
+        f"{' '.join(plants)}`; nothing here is typed in.",
         "",
         f"The `{ROBOT}` robot follows a straight line at {SPEED:g} m/s and is asked to identify the ground "
         "under every caster by "
@@ -294,11 +302,11 @@ def document(plants: Sequence[str], seeds: int) -> str:
     ]
     for plant in plants:
         for measured in ("angle", "speed"):
-            grounds = [random_ground(seed) for seed in range(seeds)]
+            grounds = [random_ground(seed) for seed in seeds]
             started = time.perf_counter()
             runs = [
                 active_run(on_ground(believed, *ground), believed, plant, seed, measured)
-                for seed, ground in enumerate(grounds)
+                for seed, ground in zip(seeds, grounds, strict=True)
             ]
             s = summarise(grounds, runs)
             parts.append(
@@ -324,12 +332,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study and write what it finds."""
     parser = argparse.ArgumentParser(prog="terrain_study", description="Identify the ground under whole robots.")
     parser.add_argument("--seeds", type=int, default=10, help="runs per plant (default: %(default)s)")
+    parser.add_argument("--first-seed", type=int, default=0, help="(default: %(default)s)")
     parser.add_argument("--plants", nargs="+", default=["reduced", "pybullet"], help="plants (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("pcw_terrain/docs/terrain_robot.md"), help="file to write")
     options = parser.parse_args(arguments)
     if options.seeds < 1:
         parser.error(f"argument --seeds: {options.seeds} is not allowed; allowed: at least 1")
-    text = document(options.plants, options.seeds)
+    text = document(options.plants, range(options.first_seed, options.first_seed + options.seeds))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(text, encoding="utf-8")
     return 0

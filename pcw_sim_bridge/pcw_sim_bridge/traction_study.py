@@ -25,21 +25,27 @@ from pcw_description.errors import PcwError
 from pcw_description.robot_file import load_robot
 
 from . import common_slip, guided_circle, slip_ratio_runs, split_friction
-from .traction_page import write_page
+from .traction_page import cost_table, read, write_page
 
+SLIP_COLUMNS = ("robot", "plant", "case", "level", "seed", "method", "slip", "took")
 PARTS = ("slip", "guided", "common", "ratio", "cost")
 Rows = Iterable[tuple[object, ...]]
 
 
-def slip_rows(robot_name: str, seeds: int, plants: Sequence[str], cases: Sequence[str]) -> Rows:
-    """Yield the slip of every method on every manoeuvre, with the runs that are drawn."""
+def slip_rows(
+    robot_name: str, seeds: int, plants: Sequence[str], cases: Sequence[str], methods: Sequence[str],
+    known: set[tuple[str, str, str, str, str]],
+) -> Rows:
+    """Yield the slip of methods on every manoeuvre that is not known yet, by plant, case, level, seed and method."""
     robot = load_robot(robot_name)
     for plant in plants:
         for case in cases:
             for level in split_friction.LEVELS[case]:
                 for seed in range(seeds):
-                    for name, slip in split_friction.slip_by_method(robot, case, level, seed, plant).items():
-                        yield robot_name, plant, case, level, seed, name, f"{slip:.6f}"
+                    left = [name for name in methods if (plant, case, level, str(seed), name) not in known]
+                    found = split_friction.slip_by_method(robot, case, level, seed, plant, left) if left else {}
+                    for name, (slip, took) in found.items():
+                        yield robot_name, plant, case, level, seed, name, f"{slip:.6f}", f"{took:.3f}"
 
 
 def cost_rows(robot_name: str, cycles: int = 3000) -> Rows:
@@ -85,6 +91,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--robot", default="thesis", help="a shipped robot or a .yaml file")
     parser.add_argument("--plants", nargs="+", default=["reduced", "pybullet"], help="plants to run on")
     parser.add_argument("--cases", nargs="+", default=list(split_friction.CASES), choices=split_friction.CASES)
+    parser.add_argument(
+        "--methods", nargs="+", default=list(split_friction.METHODS), choices=split_friction.METHODS, metavar="METHOD",
+        help="of the part slip: " + "; ".join(split_friction.METHODS),
+    )
+    parser.add_argument("--more", action="store_true", help="of the part slip: keep the runs that are there, add what misses")
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=PARTS)
     options = parser.parse_args(arguments)
     if options.seeds < 1:
@@ -93,10 +104,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     out.mkdir(parents=True, exist_ok=True)
     try:
         if "slip" in options.parts:
+            path = out / "traction_slip.csv"
+            known = {
+                (row["plant"], row["case"], row["level"], row["seed"], row["method"])
+                for row in read(path) if options.more and row["robot"] == robot
+            }  # fmt: skip
             write_csv(
-                out / "traction_slip.csv", ("robot", "plant", "case", "level", "seed", "method", "slip"),
-                slip_rows(robot, options.seeds, plants, options.cases),
-                lambda row: not (row["robot"] == robot and row["plant"] in plants and row["case"] in options.cases),
+                path, SLIP_COLUMNS,
+                slip_rows(robot, options.seeds, plants, options.cases, options.methods, known),
+                lambda row: options.more or not (
+                    row["robot"] == robot and row["plant"] in plants and row["case"] in options.cases
+                    and row["method"] in options.methods
+                ),
             )  # fmt: skip
         if "guided" in options.parts:
             write_csv(
@@ -115,6 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 out / "traction_cost.csv", ("robot", "controller", "median", "p99"), cost_rows(robot),
                 lambda row: row["robot"] != robot,
             )  # fmt: skip
+            print("\n".join(cost_table(read(out / "traction_cost.csv"))), flush=True)
         write_page(out)
     except PcwError as error:
         print(f"traction_study: {error}", file=sys.stderr)

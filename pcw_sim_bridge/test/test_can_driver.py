@@ -3,6 +3,9 @@
 Timeouts are long: these tests share a computer with others. How fast faults are met is tested in simulated time.
 """
 
+import json
+import signal
+
 import numpy as np
 import pytest
 import yaml
@@ -19,9 +22,10 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
-from pcw_sim_bridge.can.can_file import Bus  # noqa: E402
+from pcw_description.nodes.node_tools import ns_to_stamp  # noqa: E402
+from pcw_sim_bridge.can.can_file import Bus, udp_port_beside  # noqa: E402
 from pcw_sim_bridge.can.frame import Frame  # noqa: E402
-from pcw_sim_bridge.can.python_can import Echoes, PythonCanTransport  # noqa: E402
+from pcw_sim_bridge.can.python_can import Echoes, PythonCanTransport, read_log  # noqa: E402
 from pcw_sim_bridge.can.starting_file import starting_content  # noqa: E402
 
 DRIVER, EMULATOR = "pcw_sim_bridge.nodes.can_driver", "pcw_sim_bridge.can.drive_emulator"
@@ -32,9 +36,11 @@ NAMES = list(THESIS.joint_names)
 class Stack:
     """Emulator and driver with each other, and a commander that answers joint_states."""
 
-    def __init__(self, ros, folder, protocol):
-        self.ros, self.port = ros, 43200 + ros.domain
-        self.file = folder / "drives.yaml"
+    def __init__(self, ros, folder, protocol, log=False, start=True):
+        self.ros, self.port = ros, udp_port_beside(ros.domain)
+        self.file, self.stats = folder / "drives.yaml", folder / "stats.json"
+        self.log = ("-p", f"log:={folder / 'frames.blf'}") if log else ()
+        self.stamp_ns = None
         timeouts = {"command": 1.0, "feedback": 1.0, "watchdog": 1.0}
         content = starting_content(THESIS, protocol, rate=50.0, timeouts=timeouts)
         self.file.write_text(yaml.safe_dump(content))
@@ -42,26 +48,28 @@ class Stack:
         self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
         self._publisher = ros.peer.create_publisher(JointState, "joint_commands", 10)
         ros.peer.create_subscription(JointState, "joint_states", self._answer, 1000)
-        self.start_emulator()
-        self.start_driver()
+        if start:
+            self.start_emulator()
+            self.start_driver()
 
     def start_emulator(self):
         self.emulator = self.ros.start(
-            EMULATOR, before=["--can-file", str(self.file), "--udp-port", str(self.port), "--watchdog", "1.0"]
-        )
+            EMULATOR, before=["--can-file", str(self.file), "--udp-port", str(self.port), "--watchdog", "1.0",
+                              "--stats", str(self.stats)]
+        )  # fmt: skip
         self.ros.wait_for(lambda: "8 drives" in self.emulator.log)
 
-    def start_driver(self, name="can_driver"):
+    def start_driver(self, *further, name="can_driver"):
         """Another name for another process: the services of a killed one seem to be there for a while."""
         self.name = name
-        parameters = ("-p", f"can_file:={self.file}", "-p", f"udp_port:={self.port}")
+        parameters = ("-p", f"can_file:={self.file}", "-p", f"udp_port:={self.port}", *self.log, *further)
         self.driver = self.ros.start(DRIVER, "-r", f"__node:={name}", *parameters)
 
     def _answer(self, state):
         self.states.append(state)
         if self.effort is not None:
             message = JointState(name=NAMES, effort=self.effort)
-            message.header.stamp = state.header.stamp
+            message.header.stamp = state.header.stamp if self.stamp_ns is None else ns_to_stamp(self.stamp_ns)
             self._publisher.publish(message)
 
     def change(self, transition):
@@ -78,6 +86,9 @@ class Stack:
         self.effort = [1.0, 0.0] * 4
         self.states.clear()
         self.ros.wait_for(lambda: self.states and self.torques().min() > 0.5)
+
+    def stamp_of(self, state):
+        return state.header.stamp.sec * 10**9 + state.header.stamp.nanosec
 
     def torques(self):
         return np.array(self.states[-1].effort[0::2])
@@ -131,7 +142,7 @@ def test_a_killed_driver_and_a_killed_emulator_leave_the_others_safe_and_start_a
     stack.drive()
     stack.driver.process.kill()
     stack.driver.wait()
-    stack.start_driver("can_driver_again")  # the drives have stopped by their watchdogs; nobody unplugs them
+    stack.start_driver(name="can_driver_again")  # the drives have stopped by their watchdogs; nobody unplugs them
     stack.drive()
 
     stack.diagnostics.clear()
@@ -154,6 +165,66 @@ def test_without_drives_it_is_not_configured_and_says_which_are_missing(ros, tmp
     assert not stack.change(Transition.TRANSITION_CONFIGURE)
     assert stack.state() == State.PRIMARY_STATE_UNCONFIGURED
     assert "rear_right_steer: 0x1000:0 has no answer" in stack.driver.log
+
+
+def stop(stack, number):
+    """Send a signal and return how long the drives had torque after their last command [ms], once they have none."""
+    assert stack.driver.interrupt(number) == 0 and "Traceback" not in stack.driver.log, stack.driver.log
+    stack.emulator.interrupt()
+    return json.loads(stack.stats.read_text())
+
+
+STATES = [("active", "SIGTERM")] + [
+    pytest.param(*which, marks=pytest.mark.nightly)
+    for which in (("unconfigured", "SIGTERM"), ("inactive", "SIGTERM"), ("active", "SIGINT"), ("fault", "SIGTERM"),
+                  ("finalized", "SIGINT"))
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("state", "number"), STATES)
+def test_a_signal_ends_it_in_every_state_and_takes_the_torque_at_once(ros, tmp_path, state, number):
+    """The watchdogs are a second away: it is the driver that lets go, and the log of frames is whole."""
+    stack = Stack(ros, tmp_path, "odrive", log=True)
+    if state == "inactive":
+        assert stack.change(Transition.TRANSITION_CONFIGURE)
+    elif state != "unconfigured":
+        stack.drive()
+    if state == "fault":
+        stack.effort = None
+        ros.wait_for(lambda: stack.state() == State.PRIMARY_STATE_INACTIVE)
+    elif state == "finalized":
+        assert stack.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    measured = stop(stack, getattr(signal, number))
+    assert not any(measured["torque"]) and "drive_watchdog" not in measured["failures"].values()
+    if state == "active":
+        assert measured["stopped_after_ms"][-1] < 500.0  # by its last words, not by the watchdogs
+    if state != "unconfigured":
+        assert len(list(read_log(tmp_path / "frames.blf"))) > 50
+
+
+@pytest.mark.nightly
+def test_cleanup_and_configure_again_work_with_a_log(ros, tmp_path):
+    """The first log was in the way of the second once."""
+    stack = Stack(ros, tmp_path, "cia402", log=True)
+    for _ in range(2):
+        stack.drive()
+        assert stack.change(Transition.TRANSITION_DEACTIVATE) and stack.change(Transition.TRANSITION_CLEANUP)
+    stack.effort = None
+    assert [len(list(read_log(tmp_path / name))) > 50 for name in ("frames.blf", "frames_2.blf")] == [True, True]
+
+
+def test_autostart_waits_for_drives_that_are_switched_on_later(ros, tmp_path):
+    """As a launch file starts them: driver and drives at the same time."""
+    stack = Stack(ros, tmp_path, "cia402", start=False)
+    stack.start_driver("-p", "autostart:=true")
+    ros.wait_for(lambda: "has no answer" in stack.driver.log)
+    stack.start_emulator()
+    stack.effort = [1.0, 0.0] * 4
+    ros.wait_for(lambda: stack.states and stack.torques().min() > 0.5)
+    # Commands that answer readings of long ago are refused, though they go on coming.
+    stack.stamp_ns = stack.stamp_of(stack.states[0])
+    ros.wait_for(lambda: stack.said("command_timeout at joint_commands"))
+    ros.wait_for(lambda: np.abs(stack.torques()).max() < 0.2)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +251,7 @@ def test_a_bus_that_is_too_full_ends_it_with_the_arithmetic(ros, tmp_path):
 def test_frames_over_python_can_arrive_once_and_as_they_were():
     """On `virtual`, and on udp_multicast, which also gives every frame back to who sent it."""
     for interface, channel, options in (
-        ("virtual", "arrive_once", {}), ("udp_multicast", "239.74.163.2", {"port": 43199, "hop_limit": 0}),
+        ("virtual", "arrive_once", {}), ("udp_multicast", "239.74.163.2", {"port": 7639, "hop_limit": 0}),
     ):  # fmt: skip
         bus = Bus("can0", interface, channel, options=options)
         one, other = PythonCanTransport([bus]), PythonCanTransport([bus])

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import can
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from pcw_description import DescriptionError, load_robot, shipped_robots
 from pcw_sim_bridge.can.bus_load import BusLoad, check_loads, frame_bits
-from pcw_sim_bridge.can.can_file import can_file_from, read_can_file, shipped_can_files
+from pcw_sim_bridge.can.can_file import can_file_from, on_udp, read_can_file, shipped_can_files
 from pcw_sim_bridge.can.can_robot import CanRobot
 from pcw_sim_bridge.can.drive_set import bus_loads, make_drives
 from pcw_sim_bridge.can.emulated_robot import EmulatedRobot, EmulatedTransport
@@ -18,7 +19,7 @@ from pcw_sim_bridge.can.frame import PeriodicFrame
 from pcw_sim_bridge.can.motor_map import MotorMap
 from pcw_sim_bridge.can.output_gate import OutputGate
 from pcw_sim_bridge.can.starting_file import starting_content, with_joints
-from pcw_sim_bridge.can.trials import Rig
+from pcw_sim_bridge.can.trial_rig import Rig
 from pcw_sim_bridge.plants.factory import make_plant
 
 THESIS = load_robot("thesis")
@@ -36,12 +37,18 @@ def made(protocol="cia402", **changes):
 
 
 STEER = ["front_left_steer"]
+TWO_BUSES = [
+    {"name": name, "interface": "socketcan", "channel": name, "bitrate": 1_000_000} for name in ("can0", "can1")
+]
 REFUSED = [
     (lambda c: {**c, "joints": c["joints"][:7]}, "joints", "missing: rear_right_steer"),
     (lambda c: {**c, "rate": 5}, "rate", "at least 10"),
     (lambda c: {**c, "raet": 250}, "raet", "did you mean 'rate'"),
     (lambda c: {**c, "buses": []}, "buses", "at least one"),
     (lambda c: {**c, "timeouts": {"command": 5.0}}, "timeouts.command", "at most 1"),
+    (lambda c: {**c, "rate": 25}, "timeouts.command", "allowed at 25 Hz: at least 0.06 s"),
+    (lambda c: {**c, "timeouts": {"watchdog": 0.005}}, "timeouts.watchdog", "at least 0.006 s"),
+    (lambda c: {**with_joints(c, THESIS.joint_names, protocol="odrive"), "heartbeat": 0.1}, "heartbeat", "at most timeouts"),
     (lambda c: with_joints(c, STEER, node_id=1), "joints[1].node_id", "that of front_left_drive already"),
     (lambda c: with_joints(c, STEER, node_id=1.5), "joints[1].node_id", "a whole number 1 to 127"),
     (lambda c: with_joints(c, STEER, node_id=127), "joints[1].node_id", "master_id"),
@@ -167,3 +174,22 @@ def test_the_gate_lets_nothing_out_beyond_the_limits(values, armed, velocity):
         assert (np.abs(out.motor) <= THESIS.speed_limit * 20.0 * (1 + 1e-12)).all()
     else:
         assert (np.abs(out.motor) <= np.minimum(THESIS.torque_limit / 20.0, 0.8) * (1 + 1e-12)).all()
+
+
+def test_a_bus_by_multicast_hears_nothing_of_the_next():
+    """Linux hands a socket what comes for any group at its port; each bus has a port of its own."""
+    here, other = (
+        can.Bus(interface=bus.interface, channel=bus.channel, **bus.options)
+        for bus in on_udp(made(buses=TWO_BUSES), 7670).buses
+    )
+    with here, other:
+        here.send(can.Message(arbitration_id=0x123, data=b"here", is_extended_id=False))
+        heard = here.recv(2.0)
+        assert heard is not None and heard.arbitration_id == 0x123
+        assert other.recv(0.3) is None
+
+
+def test_a_port_that_leaves_none_for_the_last_bus_is_refused():
+    file = made(buses=TWO_BUSES)
+    with pytest.raises(CanError, match="udp port 65530 is not allowed; allowed: at most 65525"):
+        on_udp(file, 65530)

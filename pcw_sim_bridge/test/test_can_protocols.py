@@ -23,10 +23,10 @@ from pcw_sim_bridge.can.emulated_cia402 import OBJECTS, STRINGS, EmulatedCia402 
 from pcw_sim_bridge.can.emulated_odrive import EmulatedODrive  # noqa: E402
 from pcw_sim_bridge.can.errors import CanError  # noqa: E402
 from pcw_sim_bridge.can.frame import Frame  # noqa: E402
-from pcw_sim_bridge.can.odrive import ODriveDrive, database, layout  # noqa: E402
+from pcw_sim_bridge.can.odrive import ODriveDrive, database, error_names, layout  # noqa: E402
 from pcw_sim_bridge.can.python_can import to_frame, to_message  # noqa: E402
 from pcw_sim_bridge.can.starting_file import starting_content  # noqa: E402
-from pcw_sim_bridge.can.trials import Rig  # noqa: E402
+from pcw_sim_bridge.can.trial_rig import Rig  # noqa: E402
 
 THESIS = load_robot("thesis")
 
@@ -271,6 +271,35 @@ def test_identifiers_and_widths_are_those_of_the_protocol():
         "Get_Torques": (0x1C, 8),
     }  # fmt: skip
     assert {m.name: (m.frame_id, m.length) for m in database().messages} == published
+
+
+def test_signals_stand_where_the_protocol_has_them():
+    """First byte, type and unit of each signal, from ODrive's documentation of CANSimple and two published databases."""
+    published = {
+        "Heartbeat": {"Axis_Error": (0, "I", ""), "Axis_State": (4, "B", ""), "Procedure_Result": (5, "B", ""),
+                      "Trajectory_Done_Flag": (6, "B", "")},
+        "Get_Error": {"Active_Errors": (0, "I", ""), "Disarm_Reason": (4, "I", "")},
+        "Set_Axis_State": {"Axis_Requested_State": (0, "I", "")},
+        "Get_Encoder_Estimates": {"Pos_Estimate": (0, "f", "rev"), "Vel_Estimate": (4, "f", "rev/s")},
+        "Set_Controller_Mode": {"Control_Mode": (0, "I", ""), "Input_Mode": (4, "I", "")},
+        "Set_Input_Vel": {"Input_Vel": (0, "f", "rev/s"), "Input_Torque_FF": (4, "f", "Nm")},
+        "Set_Input_Torque": {"Input_Torque": (0, "f", "Nm")},
+        "Set_Limits": {"Velocity_Limit": (0, "f", "rev/s"), "Current_Limit": (4, "f", "A")},
+        "Get_Iq": {"Iq_Setpoint": (0, "f", "A"), "Iq_Measured": (4, "f", "A")},
+        "Get_Temperature": {"FET_Temperature": (0, "f", "degC"), "Motor_Temperature": (4, "f", "degC")},
+        "Get_Bus_Voltage_Current": {"Bus_Voltage": (0, "f", "V"), "Bus_Current": (4, "f", "A")},
+        "Get_Torques": {"Torque_Target": (0, "f", "Nm"), "Torque_Estimate": (4, "f", "Nm")},
+    }  # fmt: skip
+    letter = {(True, 32): "f", (False, 32): "I", (False, 8): "B"}
+    for name, signals in published.items():
+        found = database().get_message_by_name(name).signals
+        ours = {s.name: (s.start // 8, letter[s.is_float, s.length], s.unit or "") for s in found}
+        assert ours == signals, name
+        assert all(s.byte_order == "little_endian" and s.scale == 1 and s.offset == 0 for s in found)
+    # Whole frames, byte by byte: -2.5 turns a second with 0.25 N m, and an axis in closed loop whose watchdog has expired.
+    assert layout("Set_Input_Vel").frame(1, -2.5, 0.25) == Frame(0x02D, bytes.fromhex("000020c00000803e"))
+    assert layout("Heartbeat").unpack(bytes.fromhex("0000000108000000")) == (0x01000000, 8, 0, 0)
+    assert error_names(0x01000000 | 0x4000) == ("over_temperature", "drive_watchdog")
 
 
 def test_an_odrive_goes_through_its_states():

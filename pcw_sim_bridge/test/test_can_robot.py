@@ -18,15 +18,9 @@ from pcw_sim_bridge.can.frame import ERROR_BUS_OFF, Arrived, Frame
 from pcw_sim_bridge.can.simulated_can_run import record_run_over_can
 from pcw_sim_bridge.can.starting_file import starting_content, with_joints
 from pcw_sim_bridge.can.steer_zero import estimate_steer_zeros, write_zeros
-from pcw_sim_bridge.can.trials import (
-    ALLOWED_MS,
-    DETECTED_BY_DRIVE_ALONE,
-    FAULT_TRIALS,
-    Rig,
-    fault_trial,
-    fuzz,
-    run_verdict,
-)
+from pcw_sim_bridge.can.trial_rig import ALLOWED_MS, Rig
+from pcw_sim_bridge.can.trials import DETECTED_BY_DRIVE_ALONE, FAULT_TRIALS, fault_trial, fuzz
+from pcw_sim_bridge.can.verdict_trials import run_verdict
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.simulated_robot import JointCommand
 from pcw_sim_bridge.simulated_run import record_run
@@ -116,6 +110,21 @@ def test_a_command_that_is_refused_is_zero_torque_until_the_next(protocol):
     driven.can.cycle(lambda _: driven.can.command(broken))
     driven.transport.receive(0.002)
     assert torques(driven) == 0.0 and driven.can.armed
+
+
+@pytest.mark.parametrize("rate", [249.0, 251.0])
+def test_the_driver_keeps_the_time_of_drives_that_speak_by_their_own_clocks(rate):
+    """Once in a second such clocks pass the end of a period of 250 Hz: then no reading is whole in it, or two are."""
+    driven = rig("odrive")
+    for drive in driven.emulated.drives:
+        drive.rate = rate
+    driven.can.enable()
+    driven.cycles(200)
+    counters, begun = driven.can.counters, driven.transport.now()
+    incomplete, cycles = counters.incomplete, counters.cycles
+    driven.cycles(1000)
+    assert counters.incomplete == incomplete
+    assert (counters.cycles - cycles) / (driven.transport.now() - begun) == pytest.approx(rate, rel=5e-4)
 
 
 def test_the_newest_command_wins_and_none_queues():

@@ -58,6 +58,12 @@ def test_load_off_the_centre_on_low_friction_does_not_run_away():
     assert found["SCFC"] <= 0.040 < found["pseudo-inverse"]
 
 
+def test_where_no_sharing_helps_asking_for_less_does():
+    """All wheels on mu 0.1, asked for twice what it gives, told the friction within 10 %: the bars of split friction."""
+    found = medians("uniform", "far beyond", ("pseudo-inverse", "QP + SCFC, paced"), seeds=range(100, 101))
+    assert found["QP + SCFC, paced"] <= 0.02 * found["pseudo-inverse"] and found["QP + SCFC, paced"] <= 0.020
+
+
 def test_manoeuvres_of_a_seed_are_the_same_and_reach_the_speed():
     one, same = (split_friction.draw_manoeuvre(ROBOT, "split", "beyond", 3) for _ in range(2))
     assert one.robot == same.robot
@@ -99,21 +105,22 @@ def test_slip_that_all_wheels_have_in_common_is_limited_where_it_is_known(name):
 @pytest.mark.parametrize("motion", slip_ratio_runs.START)
 def test_slip_ratio_is_held_with_truth_and_with_the_observer(place, motion):
     wanted = slip_ratio_runs.SET_POINT if motion == "drive" else -slip_ratio_runs.SET_POINT
-    for source, bar in (("truth", 0.01), ("observer, exact", 0.02), ("observer, 1 %", 0.02)):
+    for source, bar in (("truth", 0.01), ("observer, exact", 0.02), ("observer, 1 %", 0.02), ("observer, 10 %", 0.02)):
         run = slip_ratio_runs.hold_slip_ratio(
             ROBOT, place, wanted, slip_ratio_runs.START[motion], slip_ratio_runs.SOURCES[source], seed=100
         )
         reached, rms, _ = run.score(wanted)
-        assert reached <= 0.15
+        # Within 5 %, which a velocity that may be off by as much as the last bar allows need not reach.
+        assert reached <= 0.15 or source == "observer, 10 %"
         assert rms <= bar
 
 
 def test_page_is_made_of_the_data(tmp_path, monkeypatch):
     """What stands in the CSV stands on the page, and a bar that is missed is said to be missed."""
     monkeypatch.setattr(traction_page, "figures", lambda out: {"slip": [], "guided": [], "ratio": []})
-    header = ("robot", "plant", "case", "level", "seed", "method", "slip")
-    values = {"pseudo-inverse": 1.0, "SCFC": 0.045, "QP + SCFC": 0.0123}
-    data = [("thesis", "reduced", "split", "beyond", 0, name, slip) for name, slip in values.items()]
+    header = traction_study.SLIP_COLUMNS
+    values = {"pseudo-inverse": (1.0, 2.0), "SCFC": (0.045, 2.0), "QP + SCFC": (0.0123, 2.0), "QP + SCFC, paced": (0.03, 3.0)}
+    data = [("thesis", "reduced", "split", "beyond", 0, name, *found) for name, found in values.items()]
     traction_study.write_csv(tmp_path / "traction_slip.csv", header, data, lambda row: True)
     traction_study.write_csv(tmp_path / "traction_slip.csv", header, [], lambda row: True)  # keeps what there was
     traction_page.write_page(tmp_path)
@@ -121,8 +128,10 @@ def test_page_is_made_of_the_data(tmp_path, monkeypatch):
     line = next(line for line in page.splitlines() if line.startswith("| SCFC |"))
     assert "45.0" in line and "<= 0.05 x: met" in line and "<= 40 mm/s: **not met**" in line
     assert "12.3" in page
+    line = next(line for line in page.splitlines() if line.startswith("| QP + SCFC, paced |"))
+    assert "x 1.50" in line and "<= 0.02 x: **not met**" in line
     with (tmp_path / "traction_slip.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == 3
+        assert len(list(csv.DictReader(file))) == 4
 
 
 def test_bad_input_is_refused(tmp_path, capsys):

@@ -4,7 +4,10 @@ from .active_identification import ActiveIdentification, ActiveMeasurement, Acti
 from .active_record import ActiveRecord
 from .errors import TerrainError
 from .ground_catalogue import GROUNDS, Ground, contact_on, ground, robot_on
+from .observed_ground import ObservedGround, ObservedGroundOutput, ObservedGroundState
 from .robot_terrain import RobotReading, RobotTerrain, RobotTerrainEstimate
+from .shared_friction import SharedFriction, shared_friction
+from .slip_slope import SlipSlope, SlipSlopeEstimate, SlipSlopeParameters
 from .terrain_classes import CLASSES, TerrainClass, classify
 from .terrain_estimator import TerrainEstimate, TerrainEstimator, TerrainParameters, WheelReading
 from .terrain_map import MapParameters, Place, TerrainMap
@@ -19,12 +22,19 @@ __all__ = [
     "ActiveRecord",
     "Ground",
     "MapParameters",
+    "ObservedGround",
+    "ObservedGroundOutput",
+    "ObservedGroundState",
     "Phase",
     "Place",
     "Refusal",
     "RobotReading",
     "RobotTerrain",
     "RobotTerrainEstimate",
+    "SharedFriction",
+    "SlipSlope",
+    "SlipSlopeEstimate",
+    "SlipSlopeParameters",
     "TerrainClass",
     "TerrainError",
     "TerrainEstimate",
@@ -38,4 +48,5 @@ __all__ = [
     "contact_on",
     "ground",
     "robot_on",
+    "shared_friction",
 ]

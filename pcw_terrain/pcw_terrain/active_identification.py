@@ -33,7 +33,7 @@ CREEP_RATE = 100.0
 # At which slip that no creep explains is followed; differences of encoder angles are rough [rad/s].
 STRAY_RATE = 50.0
 # Slip up to which friction is taken as proportional to it [1], and squared friction times speed needed [m^2/s^2].
-CREEP_SLIP, LEAST_CREEP = 0.04, 0.02
+CREEP_SLIP, LEAST_CREEP = 0.04, 0.01
 # How much more a turn counts than a way, at the place of the outermost caster.
 TURNING_WEIGHT = 3.0
 # A slip ratio that is commanded is no larger than this [1].
@@ -61,6 +61,7 @@ class Refusal(enum.Enum):
     TURNING = "turning, or a caster is"
     TORQUE = "the motors have not enough torque left"
     OTHERS_NEAR_LIMIT = "the other wheels would come too near their own limit"
+    DISTURBANCE = "the base would leave its path too far"
     OTHERS_SLIP = "another wheel slips"
     TOO_LONG = "it took too long"
     CANCELLED = "cancelled"
@@ -89,6 +90,7 @@ class ActiveParameters:
         longest: of one caster [s].
         force_error: part of a force that is not compensated, for the prediction of the disturbance [1].
         stiffness: k_p of the controller's pose feedback, for the same [1/s^2]; 0: none.
+        greatest_path: predicted disturbance of the base's path beyond which it does not begin [m].
     """
 
     first_slip: float = 0.03
@@ -111,6 +113,7 @@ class ActiveParameters:
     longest: float = 1.5
     force_error: float = 0.15
     stiffness: float = 100.0
+    greatest_path: float = 0.005
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -126,7 +129,7 @@ class ActiveParameters:
         require("enough", self.enough, minimum=1.0)
         for name in ("settle_time", "rest_time", "wheel_reset", "force_error", "stiffness"):
             require(name, getattr(self, name), minimum=0.0)
-        for name in ("greatest_turn_rate", "greatest_steer_rate"):
+        for name in ("greatest_turn_rate", "greatest_steer_rate", "greatest_path"):
             require(name, getattr(self, name), above=0.0)
         for name in ("others_use", "others_slip"):
             require(name, getattr(self, name), above=0.0, maximum=1.0)
@@ -169,7 +172,8 @@ class ActiveState:
         rolled_ahead: by how much the joints have turned further than wheels that roll would have (n, 2) [rad].
         creep: slip ratios that the forces take, filtered (n, 2) [1].
         strays: slip velocities that no creep explains, filtered (n,) [m/s].
-        creep_sums: of slip times friction and of friction squared, at the beginning of the test, and the relaxed slip (3,).
+        creep_sums: of slip and of what friction feigns, each times the wanted slip, at the beginning of the test, and the
+            relaxed slip (3,).
         spent: sum of the wrenches so far of the casters under test, for a force of 1 (3,) [1, 1, m].
         backwards: whether the one under test is braked.
         refusal: why it ended early.
@@ -387,6 +391,9 @@ class ActiveIdentification:
         force = np.array([float(m.mu_p[caster] * m.normal_force[caster]), 0.0])
         if force[0] * self.robot.wheel_radius[caster] > p.torque_reserve * self.robot.torque_limit[caster, DRIVE]:
             return Refusal.TORQUE
+        loads, mu_p = m.normal_force, float(m.mu_p[caster])
+        if self.predict(np.ascontiguousarray(m.position[:, STEER]), caster, loads, mu_p).path > p.greatest_path:
+            return Refusal.DISTURBANCE
         others = self._others(A, caster, force)
         index = np.delete(np.arange(self.n), caster)
         use = np.linalg.norm(others, axis=1) / np.maximum(m.mu_p[index] * m.normal_force[index], 1e-9)
@@ -490,7 +497,8 @@ class ActiveIdentification:
         rate = max(abs(velocity), self.parameters.least_speed) / max(self._relaxation[testing], 1e-6)
         product, square, relaxed = state.creep_sums
         relaxed -= math.expm1(-rate * dt) * (apart - relaxed)
-        sums = np.array([product + relaxed * feigned, square + feigned * feigned, relaxed])
+        # The slip that is wanted goes along with both and has no noise: an instrument, by which c is not biased.
+        sums = np.array([product + state.slip * relaxed, square + state.slip * feigned, relaxed])
         return dataclasses.replace(state, creep_sums=sums)
 
     def _with_creep(self, state: ActiveState, m: ActiveMeasurement) -> ActiveMeasurement:

@@ -27,6 +27,7 @@ ROUNDS = 6
 class _Instant:
     measurement: ActiveMeasurement
     effort: FloatArray
+    twist: FloatArray
     dt: float
 
 
@@ -45,10 +46,17 @@ class ActiveRecord:
     def __len__(self) -> int:
         return len(self._instants)
 
-    def add(self, measurement: ActiveMeasurement, effort: FloatArray, dt: float) -> None:
-        """Note one cycle: what was measured, motor torques (n, 2) over the time since the cycle before, and that time [s]."""
+    def add(self, measurement: ActiveMeasurement, effort: FloatArray, twist: FloatArray, dt: float) -> None:
+        """Note one cycle.
+
+        Args:
+            measurement: what was measured, with what was believed of the ground before the test.
+            effort: motor torques (n, 2) over the time since the cycle before [N m].
+            twist: that of base_link by which odometry went on in this cycle, `ActiveOutput.twist` (3,).
+            dt: time since the cycle before [s].
+        """
         require_dt(dt)
-        self._instants.append(_Instant(measurement, effort.copy(), dt))
+        self._instants.append(_Instant(measurement, effort.copy(), twist.copy(), dt))
 
     def clear(self) -> None:
         """Forget all."""
@@ -71,26 +79,23 @@ class ActiveRecord:
         follows = ~last.known
         follows[caster] = True
         only = np.arange(n) == caster
-        used, moved = None, np.zeros(3)
+        used = np.sum([instant.dt * instant.twist for instant in self._instants], axis=0)
+        path = used
         estimate: RobotTerrainEstimate
         for _ in range(ROUNDS):
             path = np.zeros(3)
             active, state = self._active.initial_state(), self._terrain.initial_state()
             for instant in self._instants:
-                measurement = instant.measurement
-                if used is not None:  # the first round is as it was
-                    measurement = dataclasses.replace(measurement, mu_p=mu_p, lambda_p=lambda_p)
+                measurement = dataclasses.replace(instant.measurement, mu_p=mu_p, lambda_p=lambda_p)
                 active, twist = self._active.twist_of_others(active, measurement, caster, instant.dt)
                 state, estimate = self._terrain.step_with_twist(
                     state, measurement.position, measurement.velocity, instant.effort, twist, instant.dt, only
                 )
                 path += instant.dt * twist
-            used = path if used is None else used
-            moved = path - used
             if not np.isfinite(estimate.mu_p[caster]):
                 break
             mu_p, lambda_p = (
                 np.where(follows, estimate.mu_p[caster], mu_p),
                 np.where(follows, estimate.lambda_p[caster], lambda_p),
             )
-        return state, estimate, moved
+        return state, estimate, path - used

@@ -30,7 +30,10 @@ NONE = "none of these"
 # How far wheels and grounds of one kind differ, as standard deviations of logarithms; assumed.
 FRICTION_SPREAD, SLIP_SPREAD = 0.12, 0.3
 NONE_PRIOR = 0.1
-TABOREK = "Taborek 1957, in Wong, Theory of Ground Vehicles"
+# Quoted from memory; the tables of other sources say 0.5 to 0.7 for gravel roads, and 0.2 to 0.3 net of soil resistance for
+# wheels on dry sand.
+UNCHECKED = "from memory, not checked against the book: "
+TABOREK = UNCHECKED + "Taborek 1957, in Wong, Theory of Ground Vehicles"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +74,7 @@ def _library() -> Mapping[str, TerrainClass]:
     others = [
         TerrainClass("gravel", 0.6, 0.3, TABOREK, "lambda_p: assumed, loose grounds peak at large slip"),
         TerrainClass(
-            "sand", 0.53, 0.45, "Wong, Theory of Ground Vehicles: dry sand, friction angle 28 degrees",
+            "sand", 0.53, 0.45, UNCHECKED + "Wong, Theory of Ground Vehicles, dry sand, friction angle 28 degrees",
             "mu_p: tan of the friction angle, soil resistance left out; lambda_p: assumed, shear grows over centimetres",
             0.25, 0.4,
         ),

@@ -56,6 +56,8 @@ LEAST_LAG, RELAXATION_LAG = 2, 1.0
 # Noise below this part of the slip is none.
 QUIET_NOISE = 0.05
 CORRELATION_SHARE = 0.005
+# Readings have to be known for a block and so many more before it, as the filter remembers what came before.
+KNOWN_BLOCKS = 1.5
 # Noise is averaged over this time [s], and blocks count from when so much of it has passed.
 NOISE_MEMORY, NOISE_SETTLED = 0.5, 0.1
 # Blocks at fewer parts of the critical slip than this say little and make older ones forgotten more slowly.
@@ -70,10 +72,18 @@ SUSPENDED, LONGEST_SUSPENSION = 5.0, 10.0
 # Curves differ from the model by this part of the friction without being another ground.
 CHANGE_FLOOR = 0.05
 YOUNG_BLOCKS = 30.0
+# How large a jump is, is told by so many of the newest residuals.
+JUMP_BLOCKS = 3
 # Forces against the slip by this many standard deviations, in this many blocks more than along it, have the wrong sign.
 WRONG_SIGN_DEVIATIONS, WRONG_SIGN_BLOCKS = 3.0, 8.0
 # Residuals of this many expected standard deviations say that the curve is another one.
 GREATEST_MISFIT = 4.0
+# After so many blocks of it what has been learned is given up.
+LONGEST_MISFIT = 50.0
+# An estimate that is valid stays so up to this many times the spread at which it becomes so.
+STAYS_VALID = 1.25
+# Spreads of the logarithms of mu_p and lambda_p up to which a reading can be compared with an estimate, valid or not.
+COMPARABLE = (0.2, 0.5)
 # A curve must fit better than a straight line by so much (twice the logarithm of the likelihood).
 BENT = 20.0
 
@@ -92,9 +102,10 @@ _CHANGES, _CHANGE_TIME, _SLIP, _FRICTION, _SLIP_NOISE, _OPENED, _CUMULATED = ran
 # the rolling speed at its beginning.
 _MEAN, _BLOCK_TIME, _BEGAN_AT = 45, 52, 53
 _RESULT = 54  # mu_p, lambda_p, variances of their logarithms and covariance, valid, misfit, reason
-_HISTORY, _BLOCK = 16, 9  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
-# instrument, whether it has been added
-_STATE = 62
+_HISTORY, _BLOCK = 16, 10  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
+# instrument, whether it has been added, residual in standard deviations
+_KNOWN_FOR, _MISFITS = 62, 63  # time for which every reading has been known [s]; blocks in a row of which none fits
+_STATE = 64
 _SUMS = 13
 # Columns of what `TerrainEstimator.run` returns.
 RESULTS = 14
@@ -331,6 +342,7 @@ def _equation(sums, j):  # type: ignore[no-untyped-def]
 def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
     """Write the result into the state."""
     result = state[_RESULT : _RESULT + 8]
+    allowed = STAYS_VALID if result[5] > 0.0 else 1.0
     result[:] = 0.0
     result[7] = TOO_FEW
     if state[_BLOCKS] < numbers[_LEAST_BLOCKS]:
@@ -402,7 +414,7 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
         result[7] = TOO_LITTLE_SLIP
     elif not (LEAST_FRICTION < mu < GREATEST_FRICTION):
         result[7] = AT_A_BOUND
-    elif math.sqrt(slip_variance) > numbers[_SLIP_SPREAD] or math.sqrt(mu_variance) > numbers[_FRICTION_SPREAD]:
+    elif max(math.sqrt(slip_variance) / numbers[_SLIP_SPREAD], math.sqrt(mu_variance) / numbers[_FRICTION_SPREAD]) > allowed:
         result[7] = TOO_WIDE
     elif result[6] > GREATEST_MISFIT:
         result[7] = NO_FIT
@@ -464,19 +476,46 @@ def _watch(table, numbers, state, history):  # type: ignore[no-untyped-def]
     share = max(CORRELATION_SHARE, 1.0 / state[_BLOCKS])
     state[_CORRELATION] += share * (min(max(expected * state[_LAST_RESIDUAL], -4.0), 4.0) - state[_CORRELATION])
     state[_LAST_RESIDUAL] = min(max(expected, -3.0), 3.0)
-    if state[_RESULT + 5] == 0.0:
+    # Valid or not: what counts is that something is known to compare with. Of a few blocks the spreads are not known either.
+    if state[_RESULT + 5] == 0.0 and state[_WEIGHT] < YOUNG_BLOCKS:
         return False
+    if state[_RESULT + 2] > COMPARABLE[0] ** 2 or state[_RESULT + 4] > COMPARABLE[1] ** 2:
+        return False
+    # Residuals that go together add up faster than by chance.
+    together = min(max(state[_CORRELATION], 0.0), 0.5)
+    variance *= (1.0 + together) / (1.0 - together)
     variance += (mu * slope * numbers[_SLIP_ACCURACY] / critical) ** 2 + (CHANGE_FLOOR * now[2]) ** 2
     # Of few blocks the spread is not known well either.
     young = 1.0 + YOUNG_BLOCKS / max(state[_WEIGHT], 1.0)
     variance += young * mu * mu * (g * g * state[_RESULT + 2] + slope * slope * x * x * state[_RESULT + 4])
     t = math.copysign(1.0, now[2]) * residual / math.sqrt(variance)
     t = min(max(t, -LARGEST_RESIDUAL), LARGEST_RESIDUAL)
+    now[9] = t
     state[_UP] = max(0.0, state[_UP] + t - ALLOWED_RESIDUAL)
     state[_DOWN] = max(0.0, state[_DOWN] - t - ALLOWED_RESIDUAL)
     suspect = state[_UP] > 0.0 or state[_DOWN] > 0.0
     state[_SUSPECT] = state[_SUSPECT] + 1.0 if suspect else 0.0
     return max(state[_UP], state[_DOWN]) > CHANGE_THRESHOLD
+
+
+@compiled
+def _began(state, history):  # type: ignore[no-untyped-def]
+    """Return the first block of the history that lies on the new ground as a whole.
+
+    The sum of residuals was last zero before the ground changed, as chance may have begun it. That it changed with block k is
+    most likely where the sum from k on of |t| less half of what it is now is largest; block k itself stands on both grounds.
+    """
+    sign = 1.0 if state[_UP] > state[_DOWN] else -1.0
+    earliest = max(_HISTORY - max(int(state[_SUSPECT]), 1), 0)
+    size = 0.0
+    for k in range(_HISTORY - JUMP_BLOCKS, _HISTORY):
+        size += sign * history[k, 9] / JUMP_BLOCKS
+    total, most, where = 0.0, -math.inf, _HISTORY - 1
+    for k in range(_HISTORY - 1, earliest - 1, -1):
+        total += sign * history[k, 9] - 0.5 * size
+        if total > most:
+            most, where = total, k
+    return min(where + 1, _HISTORY - 1)
 
 
 @compiled
@@ -496,6 +535,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     gain = full_gain * block_share(pole, math.inf, state[_BLOCK_TIME])
     settled, slip_now = state[_NOISE_TIME] > NOISE_SETTLED, mean[5]
     usable = settled and abs(slip_now) <= 1.0 and speed > numbers[_LEAST_SPEED] and load > numbers[_LEAST_LOAD] and force > 0.0
+    usable = usable and state[_KNOWN_FOR] >= KNOWN_BLOCKS * BLOCK_TIME_CONSTANTS / pole
     if not usable:
         state[_SLIP], state[_FRICTION], state[_SLIP_NOISE] = 0.0, 0.0, 0.0
         return
@@ -542,11 +582,10 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
         vote = 1.0 if slip * friction < 0.0 else -1.0
         state[_WRONG_SIGN] = min(max(state[_WRONG_SIGN] + vote, 0.0), 2.0 * WRONG_SIGN_BLOCKS)
     if _watch(table, numbers, state, history):
-        replayed = min(int(state[_SUSPECT]), _HISTORY - LEAST_LAG)
-        changes, opened = state[_CHANGES] + 1.0, history[_HISTORY - max(replayed, 1), 4]
+        begin = _began(state, history)
+        changes, opened = state[_CHANGES] + 1.0, history[begin, 4]
         _forget(state, sums)
         state[_CHANGES], state[_CHANGE_TIME], state[_OPENED] = changes, opened, 0.0
-        begin = _HISTORY - max(replayed, 1)
         history[:begin, 5] = 0.0
         history[begin:, 8] = 0.0
         _take(table, numbers, state, sums, history, _HISTORY - 1, begin)
@@ -555,17 +594,26 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     else:
         _take(table, numbers, state, sums, history, _HISTORY - 1, 0)
     _solve(numbers, state, sums)
+    # Readings that no curve fits come from more than one ground, or from a curve that is another one: begin anew.
+    state[_MISFITS] = state[_MISFITS] + 1.0 if state[_RESULT + 6] > GREATEST_MISFIT else 0.0
+    if state[_MISFITS] > LONGEST_MISFIT:
+        _forget(state, sums)
+        state[_CHANGE_TIME], state[_MISFITS] = state[_TIME], 0.0
+        history[:, 5] = 0.0
 
 
 @compiled
 def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[no-untyped-def]
-    """Take one reading (6,) in place: rolling speed, velocity, force, normal force, lateral slip, lateral force."""
+    """Take one reading (6,) in place: rolling speed, velocity, force, normal force, lateral slip, lateral force.
+
+    A normal force below zero is one of that size in a reading that says nothing.
+    """
     pole = POLE_PER_CUT_OFF * numbers[_CUT_OFF]
     share = 1.0 - math.exp(-pole * dt)
     first = state[_READINGS] == 0.0
     began_at = state[_ROLLING + 1] if not first else reading[0]
     values = (
-        (_ROLLING, reading[0]), (_VELOCITY, reading[1]), (_FORCE, reading[2]), (_LOAD, reading[3]), (_SLIP_Y, reading[4]),
+        (_ROLLING, reading[0]), (_VELOCITY, reading[1]), (_FORCE, reading[2]), (_LOAD, abs(reading[3])), (_SLIP_Y, reading[4]),
         (_FORCE_Y, reading[5]),
     )  # fmt: skip
     for index, value in values:
@@ -583,6 +631,7 @@ def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[
         state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1] = latest, reading[k]
     state[_READINGS] += 1.0
     state[_TIME] += dt
+    state[_KNOWN_FOR] = state[_KNOWN_FOR] + dt if reading[3] > 0.0 else 0.0
     state[_NOISE_TIME] += dt
     speed = max(abs(state[_ROLLING + 1]), abs(state[_VELOCITY + 1]), 1e-3)
     slip_x, slip_y = state[_ROLLING + 1] - state[_VELOCITY + 1], state[_SLIP_Y + 1]

@@ -184,17 +184,19 @@ def test_the_controller_sees_wheels_that_roll():
         ({"mu_p": np.full(4, 1.5)}, Refusal.TORQUE),
         ({"mu_p": np.array([0.5, 0.1, 0.5, 0.5])}, Refusal.OTHERS_NEAR_LIMIT),
         ({"turning": True}, Refusal.TURNING),
+        ({"soft": True}, Refusal.DISTURBANCE),
     ],
 )
 def test_it_does_not_begin_where_it_is_not_safe(changes, refusal):
-    turning = changes.pop("turning", False) if isinstance(changes, dict) else False
+    changes = dict(changes)
+    turning, soft = changes.pop("turning", False), changes.pop("soft", False)
     measured = steady(THESIS, **changes)
     if turning:
         velocity = measured.velocity.copy()
         velocity[2, STEER] = 3.0
         measured = dataclasses.replace(measured, velocity=velocity)
-        changes["turning"] = True
-    active = ActiveIdentification(THESIS)
+    # Without pose feedback nothing takes a force away that is not compensated.
+    active = ActiveIdentification(THESIS, ActiveParameters(stiffness=10.0) if soft else None)
     state = active.request(active.initial_state())
     for _ in range(100):
         state, output = active.step(state, measured, 0.002)

@@ -126,6 +126,42 @@ def test_changes_of_ground_are_found_and_settled():
     assert np.median(found.settled) <= 0.8 and np.quantile(found.settled, 0.8) <= 1.0
 
 
+def test_a_suspicion_that_chance_began_carries_nothing_into_the_new_estimate():
+    """The sum of residuals of seed 39 leaves zero by chance four blocks before mu falls from 0.8 to 0.2. The new estimate once
+    began with them: no curve fitted, nothing became valid, and as only valid estimates were watched the way back to 0.8 was
+    never found. Seeds 113, 138 and 171 settled late for the same reason.
+    """
+    for seed in (39, 138, 171):
+        found = terrain_study.change_times(range(seed, seed + 1))
+        assert found.detected.max() <= 0.3 and found.settled.max() <= 0.8
+
+
+def test_what_no_curve_fits_is_given_up():
+    """Ground that changes too often to tell apart leaves readings of both; once it stays, it is found."""
+    rng, wheel = np.random.default_rng(0), terrain_study.GroundWheel(contact=ground(0.8, 0.12))
+    moments = np.arange(9000) / RATE
+    mixed = (moments < 4.0) & (np.floor(moments / 0.06) % 2 == 0)
+    slip = 0.12 * (1.0 + 0.6 * np.sin(9.0 * moments))
+    mu_p = np.where(mixed, 0.8, 0.2)
+    run = terrain_study.run_wheel(wheel, RATE, 9.0, 1.5, rng, slip=slip, mu_p=mu_p, harmonics=0.0)
+    last = estimator_of(wheel).run(readings_of(wheel, run), 1.0 / RATE, 10)[-1]
+    assert last[IS_VALID] and last[MU_P] == pytest.approx(0.2, rel=0.03)
+
+
+def test_readings_that_say_nothing_do_not_reach_into_those_after():
+    """A load below zero marks them. Their numbers are nonsense here, and the filters remember them for a while."""
+    wheel, run = swept_run(2, (1.5, 1.5))
+    readings = readings_of(wheel, run)
+    nothing = np.floor(np.arange(len(readings)) / 150) % 3 == 0
+    readings[nothing, 1] = readings[nothing, 0]
+    readings[nothing, 2] *= 3.0
+    readings[nothing, 3] *= -1.0
+    last = estimator_of(wheel).run(readings, 1.0 / RATE, 10)[-1]
+    assert last[IS_VALID]
+    assert last[MU_P] == pytest.approx(wheel.contact.mu_p, rel=0.03)
+    assert last[LAMBDA_P] == pytest.approx(wheel.contact.lambda_p, rel=0.1)
+
+
 def test_steady_ground_does_not_change():
     """Two minutes here, and in the study for hours."""
     changes, _ = terrain_study.false_changes(range(4), 30.0)

@@ -34,7 +34,8 @@ from pcw_description.nodes.node_tools import (
 from .. import handover
 from ..controller_interface import ControllerMeasurement, ForceReference, Reference, TwistReference
 from ..controllers import CONTROLLERS, make_controller
-from ..quintic_trajectory import TrajectoryPoint, plan_point_to_point
+from ..friction_budget import FrictionBudget, plan_within_friction
+from ..quintic_trajectory import TrajectoryPoint
 from ..safety import HAZARDS, Reaction, SafetyGate
 from .controller_inputs import SLIP_SOURCES, OptionalInputs, Refused, pose_of, twist_of
 from .controller_parameters import (
@@ -70,7 +71,7 @@ class ControllerNode(RobustLifecycleNode):
         declare(self, "cmd_vel_timeout", 0.5, "zero torque after so long without it, time of joint_states", "s", (0.01, 60.0))
         declare(self, "joint_states_timeout", 0.1, "zero torque after so long without them, real time", "s", (0.01, 60.0))
         declare(self, "input_timeout", 0.2, "slip, terrain and wrenches older than this do not count", "s", (0.01, 60.0))
-        self.robot = robot
+        self.robot, self._budget = robot, FrictionBudget(robot)
         self._name = ""  # of the controller at work
         self._active, self._driving = False, False
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -78,7 +79,7 @@ class ControllerNode(RobustLifecycleNode):
             self, "controller", "computed_torque", "the controller at work", choices=tuple(CONTROLLERS),
             check=self._reason_against,
         )
-        declare_controller_parameters(self)
+        declare_controller_parameters(self, robot)
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
         self._message = JointState(name=list(robot.joint_names))
         self._faults = self._timeouts = self._refused = self._switches = 0
@@ -192,16 +193,6 @@ class ControllerNode(RobustLifecycleNode):
         del self._commands, self._optional
         return super().on_cleanup(state)
 
-    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Let go of the robot for good."""
-        self.close()
-        return super().on_shutdown(state)
-
-    def on_error(self, state: State) -> TransitionCallbackReturn:
-        """Let go of the robot after a failed transition."""
-        self.close()
-        return super().on_error(state)
-
     def close(self) -> None:
         """Send zero torque and wait until it has left."""
         self._active = False
@@ -227,7 +218,11 @@ class ControllerNode(RobustLifecycleNode):
             goal = pose_of(message)
             if not self._active or self._odometry.joint_position is None:
                 raise Refused("goal_pose; allowed: in the active state and with joint_states")
-            self._trajectory = plan_point_to_point(self._start_of_trajectory(), TrajectoryPoint(goal), motion_limits(self))
+            terrain = self._optional.fresh("terrain", self._input_timeout)
+            self._trajectory = plan_within_friction(
+                self._budget, self._start_of_trajectory(), TrajectoryPoint(goal), motion_limits(self),
+                self.get_parameter("ground_share").value, None if terrain is None else terrain[0],
+            )
         except Refused as error:
             self._refuse(str(error))
             return

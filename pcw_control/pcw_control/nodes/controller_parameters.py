@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
@@ -11,7 +12,7 @@ from pcw_description.nodes.node_tools import declare
 from pcw_description.robot_description import RobotDescription
 
 from ..computed_torque import ComputedTorqueParameters
-from ..controller_interface import ControllerParameters
+from ..controller_interface import ControllerParameters, reason_against, settable_fields, with_values
 from ..controllers import CONTROLLERS
 from ..quintic_trajectory import MotionLimits
 from ..torque_limits import MODES, TorqueLimits
@@ -23,38 +24,34 @@ _GOAL_LIMITS = MotionLimits()
 def parameter_names() -> dict[tuple[str, str], str]:
     """Return the ROS name of every field of every controller: the field's own, unless two controllers mean different things.
 
-    Keys are (controller, field). Fields of one name that differ in default, unit or range are told apart as CONTROLLER.FIELD.
+    Keys are (controller, field), `slip.loop_delay` for a field of a field. Fields of one name that differ in default, unit
+    or range are told apart as CONTROLLER.FIELD.
     """
     meanings: dict[str, set[str]] = {}
-    fields = [(name, field) for name, entry in CONTROLLERS.items() for field in _settable(entry.parameters)]
-    for _, field in fields:
-        meanings.setdefault(field.name, set()).add(repr((field.default, sorted(field.metadata.items()))))
-    return {
-        (name, field.name): field.name if len(meanings[field.name]) == 1 else f"{name}.{field.name}" for name, field in fields
-    }
+    fields = [(name, *found) for name, entry in CONTROLLERS.items() for found in settable_fields(entry.parameters())]
+    for _, path, field, value in fields:
+        meanings.setdefault(path, set()).add(repr((value, sorted(field.metadata.items()))))
+    return {(name, path): path if len(meanings[path]) == 1 else f"{name}.{path}" for name, path, _, _ in fields}
 
 
-def _settable(parameters: type[ControllerParameters]) -> list[dataclasses.Field[Any]]:
-    return [field for field in dataclasses.fields(parameters) if "range" in field.metadata or "choices" in field.metadata]
+def declare_controller_parameters(node: Node, robot: RobotDescription) -> None:
+    """Declare gains and limits, by default those that suit the robot; all can be changed while the controller runs.
 
-
-def declare_controller_parameters(node: Node) -> None:
-    """Declare gains and limits; all can be changed while the controller runs."""
+    Raises:
+        KinematicsError: a caster without offset, whose steering torque makes no side force.
+    """
     declared = set()
     names = parameter_names()
     for controller, entry in CONTROLLERS.items():
-        for field in _settable(entry.parameters):
-            name, meta = names[controller, field.name], field.metadata
+        for path, field, value in settable_fields(entry.parameters.of_robot(robot)):
+            name, meta = names[controller, path], field.metadata
             if name in declared:
                 continue
             declared.add(name)
-            if "choices" in meta:
-                declare(node, name, field.default, meta.get("description", field.name), choices=meta["choices"])
-                continue
-            above = "must be above the lower end" if meta["above"] else None
-            low = meta["range"][0]
-            check = (lambda value, low=low, above=above: above if value == low else None) if above else None
-            declare(node, name, field.default, meta["description"], meta["unit"], meta["range"], check=check)
+            declare(
+                node, name, list(value) if isinstance(value, tuple) else value, meta["description"], meta.get("unit", ""),
+                meta.get("range"), choices=meta.get("choices"), check=_refusal(field),
+            )
     for prefix, limits, what in (
         ("cmd_vel", _DEFAULT_LIMITS, "of the reference that follows cmd_vel"),
         ("goal", _GOAL_LIMITS, "of the trajectory to goal_pose"),
@@ -72,6 +69,16 @@ def declare_controller_parameters(node: Node) -> None:
     declare(node, "drive_power", 0.0, "largest mechanical power of all joints that drive; 0 is no limit", "W", (0.0, 1e6))
 
 
+def _refusal(field: dataclasses.Field[Any]) -> Callable[[Any], str | None]:
+    """Return what says why a value is refused; None for one that is allowed."""
+
+    def refusal(value: Any) -> str | None:
+        allowed = reason_against(field, value)
+        return None if allowed is None else f"{value!r} is not allowed; allowed: {allowed}"
+
+    return refusal
+
+
 def motion_limits(node: Node, prefix: str = "goal") -> MotionLimits:
     """Return the limits of the reference as the parameters are now."""
     names = ("speed", "acceleration", "yaw_rate", "yaw_acceleration")
@@ -80,13 +87,12 @@ def motion_limits(node: Node, prefix: str = "goal") -> MotionLimits:
 
 def controller_parameters(node: Node, controller: str) -> ControllerParameters:
     """Return the gains and limits of one controller as the parameters are now."""
-    kind, names = CONTROLLERS[controller].parameters, parameter_names()
-    values: dict[str, Any] = {
-        field.name: node.get_parameter(names[controller, field.name]).value for field in _settable(kind)
-    }
-    if any(field.name == "limits" for field in dataclasses.fields(kind)):
-        values["limits"] = motion_limits(node, "cmd_vel")
-    return kind(**values)
+    names = parameter_names()
+    found: Any = with_values(
+        CONTROLLERS[controller].parameters(), lambda path: node.get_parameter(names[controller, path]).value
+    )
+    limited: ControllerParameters = dataclasses.replace(found, limits=motion_limits(node, "cmd_vel"))
+    return limited
 
 
 def torque_limits(node: Node, robot: RobotDescription) -> TorqueLimits:

@@ -44,6 +44,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from pcw_description.errors import PcwError, nearest_name
+from pcw_description.one_thread import one_thread
 
 try:
     from rclpy.experimental.events_executor import EventsExecutor
@@ -71,6 +72,7 @@ def run_node(factory: Callable[[], Node], args: Sequence[str] | None = None) -> 
 
 def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
     """As `run_node`, for several nodes in one process and one executor."""
+    one_thread()
     # rclpy's own signal handlers invalidate the context at once, so that no last command (zero torque) could
     # be sent and no file be closed in order: ours only take a note.
     rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)

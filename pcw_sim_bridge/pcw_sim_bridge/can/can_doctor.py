@@ -15,6 +15,7 @@ from pcw_description.errors import PcwError
 from pcw_description.robot_file import load_robot
 
 from .can_file import on_udp, read_can_file
+from .command_line import end_on_signals
 from .doctor import NUDGE_SHARE, examine
 
 
@@ -45,15 +46,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command_line.error(f"--share {options.share:g} is not allowed; allowed: 0.01 to 0.3")
     if options.list:
         return _list()
-    nudge = not options.no_nudge
-    if nudge and not options.yes:
-        print("Every joint will move a little. Is the robot free to? [y/N] ", end="", flush=True)
-        nudge = sys.stdin.readline().strip().lower() in ("y", "yes")
+    end_on_signals()
     try:
-        return _examine(options, nudge)
+        return _examine(options)
     except PcwError as error:
         print(f"can_doctor: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("can_doctor: ended before its time; no torque is left on", file=sys.stderr)
+        return 130
 
 
 def _list() -> int:
@@ -67,7 +68,14 @@ def _list() -> int:
     return 0
 
 
-def _examine(options: argparse.Namespace, nudge: bool) -> int:
+def _may_nudge(options: argparse.Namespace) -> bool:
+    if options.no_nudge or options.yes:
+        return not options.no_nudge
+    print("Every joint will move a little. Is the robot free to? [y/N] ", end="", flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _examine(options: argparse.Namespace) -> int:
     from .python_can import PythonCanTransport
 
     robot = load_robot(options.robot)
@@ -76,6 +84,7 @@ def _examine(options: argparse.Namespace, nudge: bool) -> int:
         file = on_udp(file, options.udp_port)
     transport = PythonCanTransport(file.buses)
     wrong = 0
+    nudge = _may_nudge(options)
     try:
         for finding in examine(robot, file, transport, nudge, options.share, options.lifted):
             print(finding, flush=True)

@@ -19,12 +19,15 @@ from pcw_description.description_fields import load_yaml_mapping, quantity, read
 from pcw_description.errors import DescriptionError, nearest_name
 from pcw_description.robot_description import AXIS_NAMES, FloatArray, RobotDescription
 
+from .errors import CanError
+
 FORMAT = "pcw_can/1"
 PROTOCOLS = ("cia402", "odrive")
 HOMING_METHODS = ("absolute", "index", "switch")
 TORQUE_MODES = ("auto", "cyclic_synchronous", "profile")
 VELOCITY_UNITS = ("counts/s", "rpm")
 LARGEST_NODE_ID = {"cia402": 127, "odrive": 63}
+PERIODS_IN_TIMEOUT = 1.5
 # A gear that is said twice may differ by rounding alone.
 GEAR_TOLERANCE = 1e-3
 
@@ -92,6 +95,13 @@ class DriveJoint:
                                         maximum=200.0)  # fmt: skip
     encoder_jump: float = quantity("rad", "joint side: largest step that the speed does not explain", default=0.1, above=0.0,
                                    maximum=10.0)  # fmt: skip
+    encoder_still: float = quantity(
+        "rad", "joint side: most that a count may stand while speed or the other joints say that the joint turns",
+        default=0.01, above=0.0, maximum=10.0,
+    )  # fmt: skip
+    unwatched: bool = dataclasses.field(
+        default=False, metadata={"help": "cia402: a drive that cannot watch this computer (object 0x1016) is allowed"}
+    )
     homing: Homing | None = section("how a steering axis finds its zero; default: absolute", default=None)
 
 
@@ -169,6 +179,8 @@ def _check(read: CanFile, robot: RobotDescription) -> None:
     for i, name in enumerate(bus_names):
         if name in bus_names[:i]:
             raise DescriptionError(f"buses[{i}].name", name, "allowed: each name once")
+        if not isinstance(read.buses[i].options, Mapping):
+            raise DescriptionError(f"buses[{i}].options", read.buses[i].options, "allowed: a mapping of keys to values")
     names = [joint.name for joint in read.joints]
     for i, joint in enumerate(read.joints):
         where = f"joints[{i}]"
@@ -182,7 +194,25 @@ def _check(read: CanFile, robot: RobotDescription) -> None:
     missing = [name for name in robot.joint_names if name not in names]
     if missing:
         raise DescriptionError("joints", names, f"allowed: every joint of {robot.name}; missing: {', '.join(missing)}")
+    _check_times(read)
     _check_ids(read)
+
+
+def _check_times(read: CanFile) -> None:
+    """Refuse timeouts that a robot in health would exceed, and heartbeats that come too late to be of use."""
+    least = PERIODS_IN_TIMEOUT / read.rate
+    for name in ("command", "feedback", "watchdog"):
+        value = getattr(read.timeouts, name)
+        if value < least:
+            raise DescriptionError(
+                f"timeouts.{name}", value, f"allowed at {read.rate:g} Hz: at least {least:g} s, {PERIODS_IN_TIMEOUT:g} periods"
+            )
+    if read.heartbeat > read.timeouts.feedback and any(joint.protocol == "odrive" for joint in read.joints):
+        raise DescriptionError(
+            "heartbeat", read.heartbeat,
+            f"an ODrive says in its heartbeats alone that it has failed; allowed: at most timeouts.feedback = "
+            f"{read.timeouts.feedback:g} s",
+        )  # fmt: skip
 
 
 def _check_joint(joint: DriveJoint, where: str, read: CanFile, robot: RobotDescription) -> None:
@@ -285,15 +315,33 @@ def zeros(read: CanFile, robot: RobotDescription) -> FloatArray:
     return values
 
 
-# Where the emulated buses are when no other place is given: multicast on this computer alone.
-UDP_GROUP, UDP_PORT = "239.74.163.{}", 43113
+# Where the emulated buses are when no other place is given: multicast on this computer alone. The port is below those that
+# Linux hands out to any socket (32768 and above), where now and then it was taken, and none of DDS.
+UDP_GROUP, UDP_PORT = "239.74.163.{}", 28850
+# From the port of one bus to that of the next. Linux gives a socket what any group at its port gets, not its own alone.
+NEXT_BUS = 10
+
+
+def udp_port_beside(domain: int) -> int:
+    """Return a port for the buses of trials in a ROS domain: one that DDS itself would not use before its 97th participant."""
+    return 2600 + 250 * domain  # of DDS are 7400 + 250 domain and what follows: this is 200 on, in the range of an earlier one
 
 
 def on_udp(read: CanFile, port: int = UDP_PORT) -> CanFile:
-    """Return the file with every bus on python-can's udp_multicast, which stays on this computer."""
+    """Return the file with every bus on python-can's udp_multicast, which stays on this computer.
+
+    Raises:
+        CanError: the last bus would have a port beyond the largest.
+    """
+    largest = 65535 - NEXT_BUS * (len(read.buses) - 1)
+    if port > largest:
+        raise CanError(f"udp port {port} is not allowed; allowed: at most {largest}, each bus has one {NEXT_BUS} further on")
     buses = [
         dataclasses.replace(
-            bus, interface="udp_multicast", channel=UDP_GROUP.format(2 + i), options={"port": port, "hop_limit": 0}
+            bus,
+            interface="udp_multicast",
+            channel=UDP_GROUP.format(2 + i),
+            options={"port": port + NEXT_BUS * i, "hop_limit": 0},
         )
         for i, bus in enumerate(read.buses)
     ]

@@ -8,6 +8,8 @@ ros2 run pcw_sim_bridge can_log recording LOG --can-file FILE --out BAG
 from __future__ import annotations
 
 import argparse
+import itertools
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -19,7 +21,15 @@ from pcw_description.robot_description import RobotDescription
 from pcw_description.robot_file import load_robot
 
 from .can_file import CanFile, on_udp, read_can_file
+from .command_line import end_on_signals
+from .drive_set import make_drives
+from .errors import CanError
+from .frame import Frame
 from .frame_log import FrameDecoder, frames_of_file, write_joint_topics
+from .transport import TransmitBufferFull, Transport
+
+SENDERS = ("all", "drives", "computer")
+ROOM_WITHIN = 0.5  # that a full transmit buffer is waited for [s]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -42,12 +52,17 @@ def parser() -> argparse.ArgumentParser:
             )
         if action == "record":
             sub.add_argument("--duration", type=float, metavar="SECONDS", help="default: until interrupted")
+        if action == "replay":
+            sub.add_argument("--sent-by", choices=SENDERS, default="all",
+                             help="only frames of the drives, or of the computer (default: all)")  # fmt: skip
+            sub.add_argument("--yes", action="store_true", help="do not ask before commands go to drives")
     return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     options = parser().parse_args(arguments)
+    end_on_signals()
     try:
         robot = load_robot(options.robot)
         file = read_can_file(options.can_file, robot)
@@ -56,13 +71,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         if options.udp_port:
             file = on_udp(file, options.udp_port)
-        print(_record(options.log, file, options.duration) if options.action == "record" else _replay(options.log, file))
+        if options.action == "record":
+            print(_record(options.log, file, options.duration))
+            return 0
+        if options.sent_by != "drives" and not options.yes and not _agreed():
+            return 1
+        print(_replay(options.log, robot, file, options.sent_by))
     except PcwError as error:
         print(f"can_log: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return 0 if options.action == "record" else 130
+        return 130
     return 0
+
+
+def _agreed() -> bool:
+    print("Logged commands go to whatever drives are on the buses, which may move. Go on? [y/N] ", end="", flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def make_recording(log: Path, robot: RobotDescription, file: CanFile, out: Path) -> str:
@@ -74,8 +99,12 @@ def make_recording(log: Path, robot: RobotDescription, file: CanFile, out: Path)
     from .python_can import read_log
 
     decoder = FrameDecoder(robot, file)
+    frames = frames_of_file(read_log(log), file)
+    beginning = next(frames, None)  # a log that cannot be read leaves no folder
+    if beginning is None:
+        raise CanError(f"log {log} holds no frame; allowed: a log with frames")
     with RecordingWriter(out, flush_interval=None) as writer:
-        write_joint_topics(writer, robot, decoder, frames_of_file(read_log(log), file))
+        write_joint_topics(writer, robot, decoder, itertools.chain([beginning], frames))
         counts = dict(writer.counts)
     said = (
         ", ".join(f"{count} {topic.strip('/')}" for topic, count in counts.items()) or "nothing, as no set of joints was whole"
@@ -86,33 +115,61 @@ def make_recording(log: Path, robot: RobotDescription, file: CanFile, out: Path)
 def _record(log: Path, file: CanFile, duration: float | None) -> str:
     from .python_can import PythonCanTransport
 
+    if duration is not None and not 0.0 < duration < math.inf:
+        raise CanError(f"--duration {duration:g} is not allowed; allowed: above 0 s")
     transport = PythonCanTransport(file.buses, log=log)
     end = None if duration is None else time.monotonic() + duration
+    print(f"recording {', '.join(transport.received)} to {log}", flush=True)
     try:
-        while end is None or time.monotonic() < end:
+        while (end is None or time.monotonic() < end) and not transport.log_problem:
             transport.receive(0.1)
+    except KeyboardInterrupt:
+        pass  # how a recording ends
     finally:
         transport.close()
-    return f"{log}: {sum(transport.received.values())} frames"
+    if transport.log_problem:
+        raise CanError(f"{log}: {transport.log_problem}; allowed: a disk with room")
+    return f"{log}: {', '.join(f'{count} frames of {bus}' for bus, count in transport.received.items())}"
 
 
-def _replay(log: Path, file: CanFile) -> str:
+def _replay(log: Path, robot: RobotDescription, file: CanFile, sent_by: str) -> str:
     from .python_can import PythonCanTransport, read_log
 
+    frames = frames_of_file(read_log(log), file)
+    spoken = {(drive.joint.bus, i) for drive in make_drives(robot, file) for i in drive.spoken_identifiers}
+    beginning = next(frames, None)  # a log that cannot be read is refused before a bus is opened
     transport = PythonCanTransport(file.buses)
-    begun, first, count = time.monotonic(), None, 0
+    begun, first, count, lost = time.monotonic(), None, 0, 0
     try:
-        for bus, frame, at in frames_of_file(read_log(log), file):
+        for bus, frame, at in [] if beginning is None else itertools.chain([beginning], frames):
             first = at if first is None else first
             wait = begun + at - first - time.monotonic()
             if wait > 0.0:
                 time.sleep(wait)
-            if not frame.error:
-                transport.send(bus, frame)
+            by_drive = (bus, frame.id) in spoken and not frame.remote
+            if frame.error or sent_by != "all" and (sent_by == "drives") != by_drive:
+                continue
+            if _sent(transport, bus, frame):
                 count += 1
+            else:
+                lost += 1
+            transport.receive(0.0)  # what comes meanwhile is nobody's here
     finally:
         transport.close()
-    return f"{log}: {count} frames sent"
+    return f"{log}: {count} frames sent in {time.monotonic() - begun:.1f} s" + (f", {lost} lost" if lost else "")
+
+
+def _sent(transport: Transport, bus: str, frame: Frame) -> bool:
+    """Send a frame, waiting for room for a while; False if there was none."""
+    end = time.monotonic() + ROOM_WITHIN
+    while True:
+        try:
+            transport.send(bus, frame)
+            return True
+        except TransmitBufferFull:
+            if time.monotonic() > end:
+                return False
+            time.sleep(1e-3)
 
 
 if __name__ == "__main__":

@@ -26,24 +26,27 @@ from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDes
 from ..sensors import JointReading
 from ..simulated_robot import JointCommand
 from .bus_load import BusLoad, check_loads
-from .can_file import CanFile, Homing, joint_place
+from .can_file import CanFile, Homing, counts_per_turn, joint_place
 from .cia402 import HEARTBEAT, STATE_OPERATIONAL, SYNC
-from .drive import OFF, Ask, Drive, DriveState, Mode, Procedure, Want
+from .drive import OFF, Ask, Drive, DriveState, Mode, Procedure, Want, newer_than
 from .drive_set import bus_loads, make_drives, master_heartbeat
+from .encoder_watch import EncoderWatch
 from .errors import CanError, DriveError
 from .frame import ERROR_BUS_OFF, Arrived, Frame
 from .motor_map import MotorMap
 from .output_gate import OutputGate
-from .supervisor import DriveWatch, Fault
+from .supervisor import HEARTBEATS_MISSED, STILL, DriveWatch, Fault
 from .transport import BusOff, TransmitBufferFull, Transport
 
 ENABLE_TIME = 1.0  # in which all drives must have torque, or none keeps it [s]
-STILL = 0.05  # below this every joint stands still [rad/s]
+# Of periods, to follow drives that speak by their own clocks: where sets should be whole, and what of an error is made good.
+MIDDLE, FOLLOWED, LARGEST_SHIFT = 0.5, 0.05, 0.02
 # Behind by so many periods the missed ones are given up, not made up for.
 MOST_BEHIND = 3
 MOST_FOREIGN = 100
 # Ages of commands that are kept for their quantiles.
 AGES_KEPT = 8192
+OLD_FRAMES = 0.2  # for so long frames of another time are thrown away, and no longer on a bus that never falls silent [s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +74,7 @@ class Counters:
     commands: int = 0
     refused_commands: int = 0
     held_back: int = 0  # commands that were replaced by a newer one before they left
+    stale_commands: int = 0  # that answer a reading older than `timeouts.command`; not used
     limited: int = 0  # commands that the gate has cut
     transmit_full: int = 0
     error_frames: int = 0
@@ -88,6 +92,7 @@ class CanRobot:
         robot: the robot.
         file: its drives.
         transport: its buses, open.
+        encoders_agree: hold the encoders against each other (`encoder_watch`); not while the headings are not known yet.
 
     Attributes:
         faults: why there is no torque; empty in health.
@@ -97,7 +102,9 @@ class CanRobot:
         CanError: more axes than a bus can carry, with the arithmetic.
     """
 
-    def __init__(self, robot: RobotDescription, file: CanFile, transport: Transport) -> None:
+    def __init__(
+        self, robot: RobotDescription, file: CanFile, transport: Transport, encoders_agree: bool = True
+    ) -> None:
         self.robot, self.file, self.transport = robot, file, transport
         self.period = 1.0 / file.rate
         self.drives: tuple[Drive, ...] = make_drives(robot, file)
@@ -105,11 +112,16 @@ class CanRobot:
         check_loads(self.loads)
         self.map = MotorMap(robot, file)
         self.gate = OutputGate(robot, file, self.map)
-        self._watches = [
-            DriveWatch(drive, robot.gear_matrix[place][place[1]], self.gate.joint_torque[place], file.timeouts.feedback)
-            for drive in self.drives
-            for place in [joint_place(robot, drive.name)]
-        ]
+        self._watches = []
+        allowed, resolution = np.zeros((robot.n, 2)), np.zeros((robot.n, 2))
+        for drive in self.drives:
+            place = joint_place(robot, drive.name)
+            gear, count = robot.gear_matrix[place][place[1]], 2.0 * np.pi / counts_per_turn(drive.joint, robot)
+            allowed[place], resolution[place] = drive.joint.encoder_still, count / abs(gear)
+            torque = self.gate.joint_torque[place]
+            self._watches.append(DriveWatch(drive, gear, torque, file.timeouts.feedback, count))
+        self._encoder_watch = EncoderWatch(robot, allowed, resolution) if encoders_agree else None
+        self._standing: list[Fault] = []
         self._owners = {(drive.joint.bus, i): drive for drive in self.drives for i in drive.identifiers}
         self._command_ids = {(drive.joint.bus, i) for drive in self.drives for i in drive.command_identifiers}
         self._canopen_buses = sorted({drive.joint.bus for drive in self.drives if drive.joint.protocol == "cia402"})
@@ -145,24 +157,31 @@ class CanRobot:
         """
         self.armed, self.configured, self._enabling_since = False, False, None
         self._command, self._homing, self._next_tick = None, {}, None
-        while self.transport.receive(0.0):
+        end = self.transport.now() + OLD_FRAMES
+        while self.transport.receive(0.0) and self.transport.now() < end:
             pass  # what came before is of another time
         self._run([(drive, drive.configure()) for drive in self.drives])
-        self.faults = []
-        for watch in self._watches:
-            watch.forget()
-        end = self.transport.now() + 0.5
+        self.faults, self._standing = [], []
         begun = self.transport.now()
-        while self.transport.now() < end:
+        while self.transport.now() < begun + 0.5 and not self.faults:
             self._cycle_once(None)
-            if all(drive.feedback.position_time > begun for drive in self.drives) and self._reading is not None:
+            if self._reading is not None and not any(_not_said(drive, begun) for drive in self.drives):
                 break
-        silent = [drive.name for drive in self.drives if drive.feedback.position_time <= begun]
+        if self.faults:  # of a bus; the drives are looked at from now on
+            raise CanError("; ".join(map(str, self.faults)))
+        silent = [f"{drive.name}: no {what} comes; allowed: every period"
+                  for drive in self.drives if (what := _not_said(drive, begun))]  # fmt: skip
         if silent:
-            raise CanError(f"{', '.join(silent)}: no position comes; allowed: every period")
+            raise CanError("\n".join(silent))
+        self._forget()
+        self.configured = True
+
+    def _forget(self) -> None:
         for watch in self._watches:
             watch.forget()
-        self.configured, self.faults = True, []
+        if self._encoder_watch is not None:
+            self._encoder_watch.forget()
+        self._standing = []
 
     def clear_faults(self) -> None:
         """Set every drive up anew and forget the faults; gives no torque.
@@ -240,6 +259,9 @@ class CanRobot:
             for drive in self.drives:
                 if drive.feedback.state is DriveState.ENABLED:
                     drive.feedback.state = DriveState.DISABLED  # said before it was told to be; it has to say so anew
+            if self._encoder_watch is not None:
+                self._encoder_watch.forget()
+            self._standing = []
             self._enabling_since = self.transport.now()
 
     def request_disable(self) -> None:
@@ -283,10 +305,41 @@ class CanRobot:
             finally:
                 self._stopping = False
 
+    def still_on_without_computer(self) -> list[str]:
+        """Give the drives torque, of zero, fall silent for longer than their watchdog, and return whose drive has it still.
+
+        Torque is off afterwards, and the faults that drives rightly have are cleared.
+
+        Raises:
+            CanError: see `enable` and `clear_faults`.
+        """
+        self.enable()
+        with self._lock:
+            self.armed = False  # nothing is sent from here on
+        end = self.transport.now() + 2.0 * self.file.timeouts.watchdog + self.period
+        while (now := self.transport.now()) < end:
+            for arrived in self.transport.receive(end - now):
+                self._handle(arrived)
+        asked = self.transport.now()
+        for bus in self._canopen_buses:
+            self._send(bus, Frame(SYNC))  # a CANopen drive says its state when it is asked; it is no heartbeat
+        end = asked + max(self.period, HEARTBEATS_MISSED * self.file.heartbeat)
+        while (now := self.transport.now()) < end:
+            for arrived in self.transport.receive(end - now):
+                self._handle(arrived)
+        on = [drive.name for drive in self.drives
+              if drive.feedback.state is DriveState.ENABLED and drive.feedback.state_time >= asked]  # fmt: skip
+        self.request_disable()
+        self.clear_faults()
+        return on
+
     # --- Commands ----------------------------------------------------------------------------------------
 
     def command(self, command: JointCommand | None, answers: float | None = None) -> None:
         """Take a command; the newest counts. None, NaN and infinity are zero torque.
+
+        Without torque it is not kept: what was wanted before must not act when torque comes. One that answers a reading older
+        than `timeouts.command` has been somewhere for too long: it is counted, and as good as none.
 
         Args:
             command: joint torques or speeds.
@@ -295,13 +348,18 @@ class CanRobot:
         with self._lock:
             now = self.transport.now()
             self.counters.commands += 1
+            if not self.armed:
+                return
+            if answers is not None and now - answers > self.file.timeouts.command:
+                self.counters.stale_commands += 1
+                return
             if command is None:
                 self.counters.refused_commands += 1
             if self._waiting:
                 self.counters.held_back += 1
             self._command, self._command_time = command, now
             self._waiting = self._sent_in_cycle
-            if self.armed and not self._sent_in_cycle:
+            if not self._sent_in_cycle:
                 self._send_outputs(now)
                 self._sent_in_cycle = True
                 if answers is not None:
@@ -343,6 +401,8 @@ class CanRobot:
             self.stop([Fault("transmit_buffer_full", bus, str(error))])
         except BusOff as error:
             self.stop([Fault("bus_off", bus, str(error))])
+        except Exception as error:  # whatever an interface may raise: the other drives must still be told to stop
+            self.stop([Fault("bus_error", bus, f"{type(error).__name__}: {error}")])
         else:
             return True
         return False
@@ -384,6 +444,7 @@ class CanRobot:
                 complete = not published and self._is_complete()
             if complete:
                 published = True
+                self._follow(1.0 - (self._next_tick - self.transport.now()) / self.period - MIDDLE)
                 self._publish(on_reading, complete=True)
             if remaining <= 0.0 and not arrived:
                 break
@@ -391,26 +452,38 @@ class CanRobot:
                 break  # a flood of frames: the watch must not wait for its end
         if not published and self._reading is not None:
             self.counters.incomplete += 1
+            self._follow(1.0)  # away from the end of the period, on one side of which the last of the set must be
             self._publish(on_reading, complete=False)
+
+    def _follow(self, late: float) -> None:
+        """Shift the next period so that sets are whole in its middle; late: of this one, in periods.
+
+        Drives without SYNC speak by their own clocks. Where their period ends with ours, a set is whole now before, now after
+        that end, and every other command a period late.
+        """
+        if self._next_tick is not None and len(self._canopen_buses) < len(self.file.buses):
+            self._next_tick += min(max(FOLLOWED * late, -LARGEST_SHIFT), LARGEST_SHIFT) * self.period
 
     def _beat(self, now: float) -> None:
         if now >= self._next_heartbeat:
             self._next_heartbeat = now + master_heartbeat(self.file) * 0.999
+            if not self.configured:
+                for drive in self.drives:
+                    for frame in drive.feed():
+                        self._send(drive.joint.bus, frame)
             for bus in self._canopen_buses:
                 self._send(bus, Frame(HEARTBEAT + int(self.file.master_id), bytes((STATE_OPERATIONAL,))))
 
     def _is_complete(self) -> bool:
-        since = self._published_time
-        for drive in self.drives:
-            feedback = drive.feedback
-            if feedback.position_time <= since or feedback.velocity_time <= since:
-                return False
-        return True
+        since, now = self._published_time, self.transport.now()
+        return all(newer_than(drive.feedback, since, now, self.period) for drive in self.drives)
 
     def _publish(self, on_reading: OnReading | None, complete: bool) -> None:
         with self._lock:
             oldest = min(drive.feedback.position_time for drive in self.drives)
-            newest = max(max(drive.feedback.position_time, drive.feedback.velocity_time) for drive in self.drives)
+            newest = max(
+                max(f.position_time, f.velocity_time, f.torque_time) for f in (drive.feedback for drive in self.drives)
+            )
             joints = self._joint_reading()
             if not (np.isfinite(joints.position).all() and np.isfinite(joints.velocity).all()):
                 return
@@ -421,6 +494,10 @@ class CanRobot:
             if self._reading is not None and time <= self._reading.time:
                 time = np.nextafter(self._reading.time, np.inf)
             reading = self._reading = TimedReading(float(time), joints, complete)
+            if complete and self.armed and self._encoder_watch is not None:
+                for k, turn in self._encoder_watch.look(joints.position):
+                    detail = f"its count stands and by the other joints it turned by {turn:.3f} rad: encoder, brake, or slip"
+                    self._standing.append(Fault("encoder_stuck", self.drives[k].name, detail))
         if on_reading is not None:
             on_reading(reading)
 
@@ -469,6 +546,8 @@ class CanRobot:
         if self.armed and self._command_time is not None and now - self._command_time > self.file.timeouts.command:
             age, allowed = (now - self._command_time) * 1000, self.file.timeouts.command * 1000
             found.append(Fault("command_timeout", "joint_commands", f"none for {age:.0f} ms, allowed {allowed:.0f} ms"))
+        found += self._standing
+        self._standing = []
         if found:
             self.stop(found)
             return
@@ -570,6 +649,8 @@ class CanRobot:
         for watch in self._watches:
             if watch.drive.name.rpartition("_")[0] == name.rpartition("_")[0]:
                 watch.forget()
+        if self._encoder_watch is not None:
+            self._encoder_watch.forget()
 
     def shift_steer_zeros(self, offset: FloatArray) -> None:
         """Take offsets (n,) [rad] off what the steering axes read from now on; a wheel's reading does not jump.
@@ -607,3 +688,11 @@ class CanRobot:
                 self.request_disable()
         finally:
             self.transport.close()
+
+
+def _not_said(drive: Drive, since: float) -> str:
+    """Return what a drive has not said since a time [s]; "" if nothing."""
+    feedback = drive.feedback
+    times = {"position": feedback.position_time, "speed": feedback.velocity_time, "torque": feedback.torque_time,
+             "word of its state": feedback.state_time}  # fmt: skip
+    return next((what for what, time in times.items() if time <= since), "")

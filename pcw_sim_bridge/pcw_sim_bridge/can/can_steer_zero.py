@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import gc
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,10 +20,12 @@ from pcw_description.errors import PcwError
 from pcw_description.robot_description import RobotDescription
 from pcw_description.robot_file import load_robot
 
-from ..run_controllers import make_controller
+from ..run_controllers import RunController, make_controller
+from ..sensors import JointReading
 from ..simulated_robot import JointCommand
-from .can_file import CanFile, find_can_file, on_udp, read_can_file
+from .can_file import CanFile, find_can_file, on_udp, read_can_file, shipped_can_files
 from .can_robot import CanRobot, TimedReading
+from .command_line import end_on_signals
 from .errors import CanError
 from .steer_zero import SteerZeros, calibration_twist, estimate_steer_zeros, write_zeros
 from .transport import Transport
@@ -49,12 +52,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def measure(can: CanRobot, robot: RobotDescription, duration: float) -> SteerZeros:
-    """Drive the known motion with the drives of `can`, configured, and return the offsets; torque is off afterwards.
+    """Set up the drives of `can`, drive the known motion and return the offsets; torque is off afterwards.
 
     Raises:
         CanError: a fault stops the robot, or the motion does not tell.
     """
-    controller = make_controller("computed_torque", dataclasses.replace(robot, physics=()))
+    controller = _ready_controller(robot)
+    # Nothing was sent meanwhile, nor while the last motion was looked at: the drives have let go by themselves.
+    can.clear_faults()
     positions, velocities = [], []
     last: list[float] = []
 
@@ -80,6 +85,16 @@ def measure(can: CanRobot, robot: RobotDescription, duration: float) -> SteerZer
     return estimate_steer_zeros(robot, np.array(positions), np.array(velocities))
 
 
+def _ready_controller(robot: RobotDescription) -> RunController:
+    """Return a controller whose first command takes no longer than the next: it compiles, and drives do not wait for that."""
+    believed = dataclasses.replace(robot, physics=())
+    still = np.zeros((robot.n, 2))
+    make_controller("computed_torque", believed).command(JointReading(still, still, still), np.zeros(3), 0.01)
+    gc.collect()
+    gc.freeze()
+    return make_controller("computed_torque", believed)
+
+
 def calibrate(can: CanRobot, robot: RobotDescription, duration: float, passes: int = 3) -> tuple[np.ndarray, list[SteerZeros]]:
     """Measure, apply and measure again until nothing is left; returns the sum (n,) [rad] and what each pass found.
 
@@ -98,7 +113,7 @@ def calibrate(can: CanRobot, robot: RobotDescription, duration: float, passes: i
 
 def run(robot: RobotDescription, file: CanFile, transport: Transport, duration: float) -> tuple[np.ndarray, str]:
     """Calibrate over a transport; returns the offsets (n,) [rad] and what to tell."""
-    can = CanRobot(robot, file, transport)
+    can = CanRobot(robot, file, transport, encoders_agree=False)  # their headings are not known yet
     can.configure()
     for name, result in can.home().items():
         if result != "attained":
@@ -118,15 +133,20 @@ def run(robot: RobotDescription, file: CanFile, transport: Transport, duration: 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     options = parser().parse_args(arguments)
-    if not options.yes:
-        print("The robot will move. Free floor of two metres around it? [y/N] ", end="", flush=True)
-        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-            return 1
+    end_on_signals()
     try:
         return _main(options)
     except PcwError as error:
         print(f"can_steer_zero: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("can_steer_zero: ended before its time; no torque is left on and nothing was written", file=sys.stderr)
+        return 130
+
+
+def _agreed() -> bool:
+    print("The robot will move. Free floor of two metres around it? [y/N] ", end="", flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _main(options: argparse.Namespace) -> int:
@@ -135,10 +155,18 @@ def _main(options: argparse.Namespace) -> int:
     robot = load_robot(options.robot)
     path = find_can_file(options.can_file)
     file = read_can_file(path, robot)
+    if options.out is None and not options.dry_run and path == shipped_can_files().get(options.can_file):
+        raise CanError(f"--can-file {options.can_file} is a shipped file, which stays; allowed: a file of yours, or --out")
+    if options.out is not None and options.out.exists():
+        raise CanError(f"--out {options.out} exists already and is left as it is; allowed: a new file")
+    if not 5.0 <= options.duration <= 600.0:
+        raise CanError(f"--duration {options.duration:g} is not allowed; allowed: 5 to 600 s")
     if options.udp_port:
         file = on_udp(file, options.udp_port)
     transport = PythonCanTransport(file.buses)
     try:
+        if not options.yes and not _agreed():
+            return 1
         total, said = run(robot, file, transport, options.duration)
     finally:
         transport.close()

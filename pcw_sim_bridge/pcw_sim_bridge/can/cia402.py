@@ -9,8 +9,9 @@ that all joints are read at one instant:
     TPDO 1  0x180 + id   statusword 0x6041, position 0x6064, torque 0x6077                8 bytes
     TPDO 2  0x280 + id   velocity 0x606C, mode 0x6061, error code 0x603F                  7 bytes
 
-Torques are per mille of the rated torque 0x6076 [mN m]. The drive watches the computer by its heartbeat (0x1016) and, where it
-can, by the event timers of the RPDOs; the computer watches the drive by its TPDOs and its heartbeat (0x1017).
+Torques are per mille of the rated torque 0x6076 [mN m]. The drive watches the computer by its heartbeat (0x1016); the computer
+watches the drive by its TPDOs and its heartbeat (0x1017). The error code 0x603F is that of the last error, which many drives
+keep after a reset: what stood there when the faults were cleared is an error again only with a fault.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, FAULT_RESET = 0x00, 0x
 START_HOMING = 0x1F
 SWITCH_ON_DISABLED = 0x0040  # of the statusword
 HOMING_ATTAINED, HOMING_ERROR = 1 << 12, 1 << 13
+RESET_TRIES, RESET_WAIT = 25, 0.02  # a drive may take its time to leave the fault [s]
 # Homing methods 0x6098 by ours and the direction: on the index pulse 34 and 33, on a home switch 24 and 28.
 HOMING_METHOD = {("index", 1): 34, ("index", -1): 33, ("switch", 1): 24, ("switch", -1): 28}
 # Object, sub-index and bits of what is mapped.
@@ -121,6 +123,7 @@ class Cia402Drive(Drive):
         self.statusword = 0
         self.nmt_state: int | None = None
         self._homing_asked = False
+        self._old_code = 0  # of an error that was cleared
 
     @property
     def identifiers(self) -> Sequence[int]:
@@ -148,12 +151,17 @@ class Cia402Drive(Drive):
             else:
                 self._turns_counts = count
             self._count = count
-            self.feedback.torque = torque * self._torque_unit
-            self.feedback.set_position(self._turns_counts * self._per_count, now)
+            self.feedback.torque, self.feedback.torque_time = torque * self._torque_unit, now
+            self.feedback.state_time = now
+            self.feedback.position, self.feedback.position_time = self._turns_counts * self._per_count, now
         elif kind == TPDO2 and len(data) == 7:
             velocity, _, code = struct.unpack("<ibH", data)
             self.feedback.velocity, self.feedback.velocity_time = velocity * self._velocity_unit, now
-            self._take_error(code)
+            if code != self._old_code:
+                self._old_code = 0
+                self._take_error(code)
+            elif self.feedback.state is DriveState.FAULT:
+                self._take_error(code)
         elif kind == EMERGENCY and len(data) == 8:
             self._take_error(struct.unpack_from("<H", data)[0])
         elif kind == HEARTBEAT and len(data) == 1:
@@ -241,6 +249,7 @@ class Cia402Drive(Drive):
             raise DriveError(
                 f"{self.name}: device type 0x1000 = {device & 0xFFFF} is not allowed; allowed: 402, a CiA 402 drive"
             )
+        yield from self._write(0x6040, 0, DISABLE_VOLTAGE, 2)  # whatever another computer has left on
         vendor = yield from self._read(0x1018, 1)
         product = yield from self._read(0x1018, 2)
         self.identity = f"vendor 0x{vendor:X}, product 0x{product:X}"
@@ -252,9 +261,7 @@ class Cia402Drive(Drive):
         yield from self._check_motor()
         yield from self._choose_mode()
         yield from self._write(0x1017, 0, round(self.heartbeat * 1000), 2)
-        yield from self._write(
-            0x1016, 1, (self._master_id << 16) | round(self.watchdog * 1000), 4, "it does not watch this computer"
-        )
+        yield from self._watch_this_computer()
         yield from self._write(0x6007, 0, 1, 2, "it does not say what it does without this computer")
         yield from self._write(
             0x6072, 0, _whole(self._largest_torque / self._torque_unit, 16), 2, "its torque limit is its own"
@@ -281,6 +288,19 @@ class Cia402Drive(Drive):
             self.notes.append(
                 f"torque_constant is {self.joint.torque_constant:g} N m/A, rated torque over rated current {implied:.4g}"
             )
+
+    def _watch_this_computer(self) -> Generator[Ask, Frame | None, None]:
+        entry = (self._master_id << 16) | round(self.watchdog * 1000)
+        if self.joint.unwatched:
+            yield from self._write(0x1016, 1, entry, 4, "it does not watch this computer")
+            return
+        try:
+            yield from self._write(0x1016, 1, entry, 4)
+        except sdo.SdoAbort as error:
+            raise DriveError(
+                f"{error}; nothing would stop it without this computer; allowed: a drive that watches heartbeats, or "
+                "unwatched: true in the file"
+            ) from error
 
     def _choose_mode(self) -> Generator[Ask, Frame | None, None]:
         supported = yield from self._read(0x6502)
@@ -312,10 +332,13 @@ class Cia402Drive(Drive):
         self.feedback.error_names, self.feedback.homing, self.feedback.restarted = (), None, False
         for word in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
             yield from self._write(0x6040, 0, word, 2)
-        status = yield from self._read(0x6041)
-        self._take_status(status)
-        code = yield from self._read(0x603F)
-        self._take_error(code)
+        for _ in range(RESET_TRIES):
+            self._take_status((yield from self._read(0x6041)))
+            if self.feedback.state is not DriveState.FAULT:
+                break
+            yield Ask(None, lambda _: False, "fault reset", RESET_WAIT, tries=1)
+        code = self._old_code = yield from self._read(0x603F)
+        self.feedback.error_names = ()
         if self.feedback.state is DriveState.FAULT:
             said = error_name(code) or "drive_fault"
             self.feedback.error_names = (said,)

@@ -65,7 +65,7 @@ def examine(
         share: of the joint's torque limit that it is nudged with.
         lifted: the wheels are off the ground, so that gears can be judged by the speed that is gained.
     """
-    can = CanRobot(robot, file, transport)
+    can = CanRobot(robot, file, transport, encoders_agree=False)
     for load in can.loads.values():
         yield Finding(load.load <= load.allowed, load.bus, f"{load.load:.0%} of {load.bitrate / 1000:g} kbit/s will be in use")
     try:
@@ -83,6 +83,7 @@ def examine(
     yield from _listen(can)
     if nudge and not can.faults:
         try:
+            yield from _fall_silent(can)
             for name in robot.joint_names:
                 yield from _nudge(can, name, share, lifted)
                 if can.faults:
@@ -121,6 +122,26 @@ def _listen(can: CanRobot) -> Iterator[Finding]:
         median, most = 1000.0 * float(np.median(latencies)), 1000.0 * float(np.max(latencies))
         good = most < 1000.0 * can.file.timeouts.feedback
         yield Finding(good, "latency", f"from the reading to all frames of it {median:.2f} ms, {most:.2f} ms at most")
+
+
+def _fall_silent(can: CanRobot) -> Iterator[Finding]:
+    """Say nothing to drives that have torque, of zero: each must take it away by itself."""
+    try:
+        on = can.still_on_without_computer()
+    except CanError as error:
+        for line in str(error).splitlines():
+            yield Finding(False, "watchdog", line)
+        return
+    allowed = 2000.0 * can.file.timeouts.watchdog
+    for name in on:
+        remedy = "enable_watchdog and watchdog_timeout" if _protocol(can, name) == "odrive" else "objects 0x1016 and 0x6007"
+        yield Finding(False, name, f"it still has torque {allowed:.0f} ms after this computer fell silent: see its {remedy}")
+    if not on:
+        yield Finding(True, "watchdog", f"every drive takes its torque away within {allowed:.0f} ms without this computer")
+
+
+def _protocol(can: CanRobot, name: str) -> str:
+    return next(drive.joint.protocol for drive in can.drives if drive.name == name)
 
 
 def _nudge(can: CanRobot, name: str, share: float, lifted: bool) -> Iterator[Finding]:

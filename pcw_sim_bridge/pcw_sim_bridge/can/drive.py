@@ -80,7 +80,8 @@ class Feedback:
         velocity: [rad/s].
         torque: [N m].
         temperature: the largest that it reports [degC]; NaN where it reports none.
-        position_time: when the position came [s].
+        position_time, velocity_time, torque_time, temperature_time: when each came [s].
+        state_time: when the drive last said in which state it is [s].
         heard_time: when anything came [s].
         error_names: what the drive says is wrong.
         homing: None, "busy", "attained" or "failed".
@@ -88,23 +89,28 @@ class Feedback:
 
     __slots__ = (
         "position", "velocity", "torque", "temperature", "position_time", "heard_time", "state", "error_names", "homing",
-        "restarted", "previous_position", "previous_time", "previous_velocity", "velocity_time",
+        "restarted", "velocity_time", "torque_time", "state_time", "temperature_time",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self.position = self.velocity = self.torque = self.temperature = math.nan
-        self.previous_position = self.previous_velocity = math.nan
-        self.position_time = self.heard_time = self.previous_time = self.velocity_time = -math.inf
+        self.position_time = self.heard_time = self.velocity_time = -math.inf
+        self.torque_time = self.state_time = self.temperature_time = -math.inf
         self.state = DriveState.UNKNOWN
         self.error_names: tuple[str, ...] = ()
         self.homing: str | None = None
         self.restarted = False
 
-    def set_position(self, position: float, now: float) -> None:
-        """Take a new position, keeping the one before for the watch over jumps."""
-        self.previous_position, self.previous_time = self.position, self.position_time
-        self.previous_velocity = self.velocity
-        self.position, self.position_time = position, now
+
+def newer_than(feedback: Feedback, since: float, now: float, period: float) -> bool:
+    """Whether position, speed and torque have come since a time [s].
+
+    A torque is waited for only where torques come at the rate of positions: it belongs to the same instant then, and in the
+    order of its frames a drive may send it last.
+    """
+    if feedback.position_time <= since or feedback.velocity_time <= since:
+        return False
+    return feedback.torque_time > since or now - feedback.torque_time > 2.0 * period
 
 
 class Drive(ABC):
@@ -164,6 +170,10 @@ class Drive(ABC):
     def output(self, want: Want, now: float) -> list[Frame]:
         """Return what to send for what is wanted, one step nearer to it where the drive needs several."""
 
+    def feed(self) -> list[Frame]:
+        """Return what keeps the drive's watchdog content, without torque, while it is being set up."""
+        return []
+
     @abstractmethod
     def prepare_homing(self, method: str, speed: float, direction: float) -> Procedure:
         """Set up a search for the mark, at a speed of the motor [rad/s]; `Mode.HOMING` then begins it."""
@@ -175,6 +185,11 @@ class Drive(ABC):
     @abstractmethod
     def decode_command(self, frame: Frame) -> Want | None:
         """Return what a logged frame from the computer asks of this drive; None for any other frame."""
+
+    @property
+    def spoken_identifiers(self) -> Sequence[int]:
+        """Of `identifiers` those that only the drive uses for frames with data."""
+        return self.identifiers
 
     @property
     @abstractmethod

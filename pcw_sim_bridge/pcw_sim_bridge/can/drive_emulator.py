@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import math
 import queue
 import signal
 import sys
@@ -22,13 +23,14 @@ from typing import Any, TextIO
 import numpy as np
 
 from pcw_description.errors import PcwError
+from pcw_description.one_thread import one_thread
 from pcw_description.robot_file import load_robot
 
 from ..plants.factory import make_plant
 from ..plants.plant import PLANT_NAMES
 from .can_file import UDP_PORT, on_udp, read_can_file
 from .emulated_drive import FAULTS
-from .emulated_robot import BUS_FAULTS, EmulatedRobot
+from .emulated_robot import BUS_FAULTS, EmulatedRobot, check_fault
 from .errors import CanError
 from .transport import BusOff, TransmitBufferFull, Transport
 
@@ -71,7 +73,8 @@ class FaultTimer:
     """Times from a fault, or from the last command, to zero torque at every drive.
 
     Attributes:
-        reactions: one entry for each fault: name, place, when, and milliseconds to zero torque (None until then).
+        reactions: one entry for each fault: name, place, when, whether a drive had torque then, and milliseconds to zero
+            torque (None until then).
     """
 
     def __init__(self, emulated: EmulatedRobot) -> None:
@@ -88,7 +91,7 @@ class FaultTimer:
         if name.endswith("heal"):
             return
         self._open.append({"fault": name, "where": where, "at": round(self._emulated.time - self._emulated.start, 4),
-                           "zero_after_ms": None})  # fmt: skip
+                           "driving": self.had_torque, "zero_after_ms": None})  # fmt: skip
         self.reactions.append(self._open[-1])
 
     def on_step(self, time: float) -> None:
@@ -124,6 +127,8 @@ def statistics(emulated: EmulatedRobot, timer: FaultTimer) -> dict[str, Any]:
         "pose": [round(value, 5) for value in emulated.plant.state().pose.tolist()],
         "reactions": timer.reactions,
         "stopped_after_ms": timer.stopped_after,
+        "stopped_at": [round(time, 6) for time in timer.stopped_at],
+        "failures": {drive.name: drive.failure for drive in emulated.drives if drive.failure},
     }  # fmt: skip
 
 
@@ -140,10 +145,37 @@ def read_faults(lines: Sequence[str]) -> list[tuple[float, str, str]]:
             continue
         try:
             name, where, seconds = words
+            if not 0.0 <= float(seconds) < math.inf:
+                raise ValueError
             faults.append((float(seconds), name, where))
         except ValueError:
             raise CanError(f"fault {line!r} is not allowed; allowed: 'NAME WHERE SECONDS'") from None
     return sorted(faults)
+
+
+def _fault_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CanError(f"--faults {path} cannot be read: {error}; allowed: a file of lines 'NAME WHERE SECONDS'") from None
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    """Refuse numbers that are no durations, before anything is opened.
+
+    Raises:
+        CanError: names the option, the value and what is allowed.
+    """
+    for name, least, most in (("duration", 0.0, 1e9), ("watchdog", 0.005, 10.0)):
+        value = getattr(options, name)
+        if value is not None and not least < value <= most:
+            raise CanError(f"--{name} {value:g} is not allowed; allowed: above {least:g} to {most:g} s")
+    if not 0 <= options.udp_port <= 65535:
+        raise CanError(f"--udp-port {options.udp_port} is not allowed; allowed: 1 to 65535, or 0 for the buses of the file")
+    if options.seed < 0:
+        raise CanError(f"--seed {options.seed} is not allowed; allowed: 0 and above")
+    if options.stats is not None and not options.stats.resolve().parent.is_dir():
+        raise CanError(f"--stats {options.stats} is not allowed; allowed: a file in a folder that exists")
 
 
 def serve(
@@ -222,11 +254,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace, stopped: threading.Event) -> None:
     from .python_can import PythonCanTransport
 
+    _check_options(options)
+    one_thread()
     robot = load_robot(options.robot)
     file = read_can_file(options.can_file, robot)
     if options.udp_port:
         file = on_udp(file, options.udp_port)
-    planned = read_faults(options.fault + (options.faults.read_text().splitlines() if options.faults else []))
+    planned = read_faults(options.fault + (_fault_lines(options.faults) if options.faults else []))
+    for _, name, where in planned:
+        check_fault(name, where, file)
     plant = make_plant(options.plant, robot, lifted=options.lifted)
     plant.step(np.zeros((robot.n, 2)))  # compiled before anybody waits
     plant.reset()

@@ -59,6 +59,10 @@ class EmulatedCia402(EmulatedDrive):
     Args:
         joint, rate, heartbeat, watchdog: see `EmulatedDrive`; a CANopen drive is told them by its master.
         counts: per turn of the motor.
+
+    Attributes:
+        keeps_error_code: 0x603F stays that of the last error after a reset, as in many drives.
+        lacks: objects that it refuses.
     """
 
     def __init__(self, joint: DriveJoint, rate: float, heartbeat: float, watchdog: float, counts: float) -> None:
@@ -67,6 +71,9 @@ class EmulatedCia402(EmulatedDrive):
         self._per_count = math.tau / counts
         self._torque_unit = joint.rated_torque / 1000.0
         self._velocity_unit = self._per_count if joint.velocity_unit == "counts/s" else math.tau / 60.0
+        self.keeps_error_code = False
+        self.lacks: set[int] = set()
+        self._last_error = 0
         self.power_on(0.0)
 
     def power_on(self, now: float) -> list[Frame]:
@@ -88,6 +95,7 @@ class EmulatedCia402(EmulatedDrive):
             self.objects[0x1400 + i, 1] = cia402.COB_INVALID | (base + self.node_id)
             self.objects[0x1800 + i, 1] = cia402.COB_INVALID | (base - 0x80 + self.node_id)
         self.nmt, self.state, self._error, self._homing_done = STATE_PRE_OPERATIONAL, "switch on disabled", 0, False
+        self.failure = ""
         self._segments: bytes | None = None
         self._toggle = 0
         self._last_word = 0
@@ -202,7 +210,7 @@ class EmulatedCia402(EmulatedDrive):
         state = self.state
         if state == "fault":
             if rising & cia402.FAULT_RESET and not self._fault_lasts():
-                self.state, self._error = "switch on disabled", 0
+                self.state, self._error, self.failure = "switch on disabled", 0, ""
                 return [Frame(cia402.EMERGENCY + self.node_id, bytes(8))]
         elif not word & 0x02:
             self.state = "switch on disabled"  # disable voltage
@@ -244,14 +252,14 @@ class EmulatedCia402(EmulatedDrive):
         """Put what the sensors see into the objects."""
         count = round(self.shown_position / self._per_count)
         self.objects[0x6064, 0] = (count + (1 << 31)) % (1 << 32) - (1 << 31)
-        self.objects[0x606C, 0] = _within(round(self.velocity / self._velocity_unit), 32)
+        self.objects[0x606C, 0] = _within(round(self.shown_velocity / self._velocity_unit), 32)
         self.objects[0x6077, 0] = _within(round(self.shown_torque / self._torque_unit), 16)
         status = STATUS[self.state]
         if self.state == "operation enabled" and self.mode == HOMING and self._homing_done:
             status |= HOMING_ATTAINED | 1 << 10
         self.objects[0x6041, 0] = status
         self.objects[0x6061, 0] = self.mode
-        self.objects[0x603F, 0] = self._error
+        self.objects[0x603F, 0] = self._error or (self._last_error if self.keeps_error_code else 0)
         self.objects[0x1001, 0] = 1 if self._error else 0
 
     def _bytes(self, key: tuple[int, int]) -> bytes:
@@ -279,6 +287,7 @@ class EmulatedCia402(EmulatedDrive):
     def trip(self, name: str, now: float) -> list[Frame]:
         """Fail."""
         self.state, self._error, self.mark_wanted = "fault", ERROR_CODE[name], 0
+        self._last_error, self.failure = self._error, name
         self.objects[0x6071, 0] = self.objects[0x60FF, 0] = 0
         if self.silent:
             return []
@@ -323,8 +332,8 @@ class EmulatedCia402(EmulatedDrive):
         return answer
 
     def _download(self, key: tuple[int, int], value: bytes, now: float) -> bytes:
-        if key not in OBJECTS:
-            known = any(index == key[0] for index, _ in OBJECTS)
+        if key not in OBJECTS or key[0] in self.lacks:
+            known = any(index == key[0] for index, _ in OBJECTS if index not in self.lacks)
             return _abort(key, 0x06090011 if known else 0x06020000)
         size, signed, writable = OBJECTS[key]
         if not writable:

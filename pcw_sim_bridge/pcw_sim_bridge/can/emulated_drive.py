@@ -11,6 +11,7 @@ from .drive import Mode
 from .frame import Frame
 
 AMBIENT, HOT = 35.0, 120.0  # [degC]
+JUMP = 4.0 * math.tau  # of a motor's count [rad]
 
 
 class EmulatedDrive(ABC):
@@ -25,6 +26,7 @@ class EmulatedDrive(ABC):
         command_time: when a torque or velocity last came [s].
         commands: how many came.
         mark_wanted: it turns and looks for its mark, at `value` of `want`.
+        failure: why it failed, by the name of `supervisor`; "" in health.
     """
 
     def __init__(self, joint: DriveJoint, rate: float, heartbeat: float, watchdog: float) -> None:
@@ -36,10 +38,13 @@ class EmulatedDrive(ABC):
         self.dead = self.silent = False
         self.report_factor = 0.0  # torque that it reports beyond what it gives [N m]
         self._frozen: float | None = None
+        self._jumped = 0.0
+        self._blind = False  # its speed stands with its position
         self.command_time = -math.inf
         self.commands = 0
         self.mark_wanted = 0
         self.homing_speed, self.homing_direction = 1.0, 1
+        self.failure = ""
 
     # --- What the robot sees -----------------------------------------------------------------------------
 
@@ -53,13 +58,18 @@ class EmulatedDrive(ABC):
         return self._frozen if self._frozen is not None else self.position - self.offset
 
     @property
+    def shown_velocity(self) -> float:
+        """What it makes of its encoder [rad/s]."""
+        return 0.0 if self._blind else self.velocity
+
+    @property
     def shown_torque(self) -> float:
         """What it measures [N m]."""
         return self.torque + self.report_factor
 
     def mark_passed(self, position: float) -> None:
         """The mark was at this angle of the motor [rad]: it counts from there."""
-        self.offset, self.mark_wanted = position, 0
+        self.offset, self._jumped, self.mark_wanted = position, 0.0, 0
         self._homed()
 
     @abstractmethod
@@ -99,17 +109,19 @@ class EmulatedDrive(ABC):
         elif name == "hot":
             self.temperature = HOT
         elif name == "encoder_jump":
-            self.offset += 4.0 * math.tau
-        elif name == "encoder_stuck":
-            self._frozen = self.shown_position
+            self.offset += JUMP
+            self._jumped += JUMP
+        elif name in ("encoder_stuck", "encoder_dead"):
+            self._frozen, self._blind = self.shown_position, name == "encoder_dead"
         elif name == "over_torque":
             self.report_factor = 10.0 * self.joint.torque_constant * self.joint.current_limit
         elif name == "restart":
             return self.power_on(now)
         elif name == "heal":
             was_dead = self.dead
+            self.offset, self._jumped = self.offset - self._jumped, 0.0
             self.dead = self.silent = False
-            self.temperature, self.report_factor, self._frozen = AMBIENT, 0.0, None
+            self.temperature, self.report_factor, self._frozen, self._blind = AMBIENT, 0.0, None, False
             return self.power_on(now) if was_dead else []
         return []
 
@@ -123,6 +135,7 @@ FAULTS = {
     "over_current": "it trips",
     "encoder_jump": "its count steps by four turns of the motor",
     "encoder_stuck": "its position stands while its speed goes on",
+    "encoder_dead": "its position stands and its speed is zero, whatever the motor does",
     "over_torque": "it reports far more torque than it was told",
     "restart": "it starts anew, with everything that was set gone",
     "heal": "all of this ends, and it can be set up again",

@@ -26,17 +26,23 @@ VERSION = (2, 4, 4, 58, 0, 6, 9, 0)
 
 
 class EmulatedODrive(EmulatedDrive):
-    """One axis; see `EmulatedDrive`."""
+    """One axis; see `EmulatedDrive`.
+
+    Attributes:
+        watches_when_idle: its watchdog wants to be fed in the idle state too, as with some firmware.
+        unwatched: its watchdog is not enabled.
+    """
 
     def __init__(self, joint: DriveJoint, rate: float, heartbeat: float, watchdog: float) -> None:
         super().__init__(joint, rate, heartbeat, watchdog)
         self._torque_constant = joint.torque_constant
+        self.watches_when_idle = self.unwatched = False
         self.power_on(0.0)
 
     def power_on(self, now: float) -> list[Frame]:
         """Start anew; what is set in the drive is kept there."""
         self.state, self.errors, self.disarm_reason, self.result = IDLE, 0, 0, SUCCESS
-        self.control_mode = TORQUE_CONTROL
+        self.control_mode, self.failure = TORQUE_CONTROL, ""
         self.input_torque = self.input_velocity = 0.0
         self.velocity_limit = self.current_limit = math.inf
         self._fed = now
@@ -76,9 +82,10 @@ class EmulatedODrive(EmulatedDrive):
                 self.input_torque = values[0]
         elif command == layout("Set_Input_Vel").command:
             values = layout("Set_Input_Vel").unpack(frame.data)
-            if values is not None and math.isfinite(values[0]):
+            if values is not None and math.isfinite(values[0]) and math.isfinite(values[1]):
                 self._feed(now)
                 self.input_velocity = values[0] * math.tau
+                self.input_torque = values[1]  # in torque control it is the torque, else it is added
         elif command == layout("Set_Axis_State").command:
             values = layout("Set_Axis_State").unpack(frame.data)
             if values is not None:
@@ -86,8 +93,7 @@ class EmulatedODrive(EmulatedDrive):
         elif command == layout("Set_Controller_Mode").command:
             values = layout("Set_Controller_Mode").unpack(frame.data)
             if values is not None and values[0] in (TORQUE_CONTROL, VELOCITY_CONTROL):
-                self.control_mode = values[0]
-                self.input_torque = self.input_velocity = 0.0
+                self.control_mode = values[0]  # the inputs stay as they are
         elif command == layout("Set_Limits").command:
             values = layout("Set_Limits").unpack(frame.data)
             if values is not None and values[0] > 0.0 and values[1] > 0.0:
@@ -95,6 +101,7 @@ class EmulatedODrive(EmulatedDrive):
         elif command == layout("Clear_Errors").command and len(frame.data) <= 1:
             self._fed = now
             self.errors = 0 if self.temperature <= 100.0 else ERROR_BIT["over_temperature"]
+            self.failure = "" if not self.errors else "over_temperature"
         elif command == layout("Estop").command:
             self.trip_bits(0x02000000)
         return []
@@ -114,7 +121,6 @@ class EmulatedODrive(EmulatedDrive):
             if self.state in (HOMING, ENCODER_INDEX_SEARCH):
                 self.result = CANCELLED
             self.state, self.mark_wanted = IDLE, 0
-            self.input_torque = self.input_velocity = 0.0
 
     def _answer(self, command: int) -> list[Frame]:
         for name in ("Get_Version", "Get_Encoder_Estimates", "Get_Iq", "Get_Temperature", "Get_Error",
@@ -129,7 +135,7 @@ class EmulatedODrive(EmulatedDrive):
             "Get_Version": VERSION,
             "Heartbeat": (self.errors, self.state, self.result, 0),
             "Get_Error": (self.errors, self.disarm_reason),
-            "Get_Encoder_Estimates": (self.shown_position / math.tau, self.velocity / math.tau),
+            "Get_Encoder_Estimates": (self.shown_position / math.tau, self.shown_velocity / math.tau),
             "Get_Iq": (iq, iq),
             "Get_Temperature": (self.temperature, self.temperature - 5.0 if self.temperature > AMBIENT else AMBIENT),
             "Get_Bus_Voltage_Current": (24.0, 1.0),
@@ -141,7 +147,8 @@ class EmulatedODrive(EmulatedDrive):
         """Send what is due; trip when nobody feeds the watchdog."""
         if self.dead:
             return []
-        if self.state == CLOSED_LOOP and now - self._fed > self.watchdog:
+        watching = not self.unwatched and not self.errors and (self.state == CLOSED_LOOP or self.watches_when_idle)
+        if watching and now - self._fed > self.watchdog:
             self.trip("drive_watchdog", now)
         periods = {"Heartbeat": self.heartbeat, "Get_Encoder_Estimates": 1.0 / self.rate, "Get_Iq": 1.0 / self.rate,
                    "Get_Temperature": 1.0 / TEMPERATURE_RATE}  # fmt: skip
@@ -156,9 +163,10 @@ class EmulatedODrive(EmulatedDrive):
     def trip(self, name: str, now: float) -> list[Frame]:
         """Fail; an ODrive says so in its next heartbeat, which it sends at once."""
         self.trip_bits(ERROR_BIT[name])
+        self.failure = name
         return [] if self.silent else [self._message("Heartbeat")]
 
     def trip_bits(self, bits: int) -> None:
         """Fail with these bits of Axis_Error."""
         self.errors, self.disarm_reason, self.state = self.errors | bits, bits, IDLE
-        self.mark_wanted, self.input_torque, self.input_velocity = 0, 0.0, 0.0
+        self.mark_wanted = 0

@@ -248,9 +248,8 @@ class EmulatedRobot:
         Raises:
             CanError: no such fault or place.
         """
+        check_fault(fault, where, self.file)
         if fault in BUS_FAULTS:
-            if where not in self.frames_in:
-                raise CanError(f"fault {fault} at {where!r} is not allowed; allowed: {', '.join(self.frames_in)}")
             if fault == "bus_off":
                 self._put(where, Frame(ERROR_BUS_OFF, bytes(8), error=True))
                 self.off_buses.add(where)
@@ -260,10 +259,6 @@ class EmulatedRobot:
                 self.off_buses.discard(where)
                 self._foreign.discard(where)
             return
-        if fault not in FAULTS:
-            raise CanError(f"fault {fault!r} is not allowed; allowed: {', '.join([*FAULTS, *BUS_FAULTS])}")
-        if where != "all" and where not in self._by_name:
-            raise CanError(f"fault {fault} at {where!r} is not allowed; allowed: all, {', '.join(self._by_name)}")
         self._sample()
         for drive in self.drives if where == "all" else [self._by_name[where]]:
             for frame in drive.inject(fault, self.time):
@@ -272,6 +267,19 @@ class EmulatedRobot:
     def close(self) -> None:
         """Free the plant."""
         self.plant.close()
+
+
+def check_fault(fault: str, where: str, file: CanFile) -> None:
+    """Refuse what is no fault, or cannot be done there.
+
+    Raises:
+        CanError: names it, and what is allowed.
+    """
+    if fault not in FAULTS and fault not in BUS_FAULTS:
+        raise CanError(f"fault {fault!r} is not allowed; allowed: {', '.join([*FAULTS, *BUS_FAULTS])}")
+    places = [bus.name for bus in file.buses] if fault in BUS_FAULTS else ["all", *(joint.name for joint in file.joints)]
+    if where not in places:
+        raise CanError(f"fault {fault} at {where!r} is not allowed; allowed: {', '.join(places)}")
 
 
 class EmulatedTransport:

@@ -19,7 +19,7 @@ from pcw_description.ros_messages import joint_state
 
 from .can_file import CanFile
 from .cia402 import SYNC
-from .drive import Drive, Mode, Want
+from .drive import Drive, Mode, Want, newer_than
 from .drive_set import make_drives
 from .frame import Frame
 from .motor_map import MotorMap
@@ -56,7 +56,7 @@ class FrameDecoder:
     """
 
     def __init__(self, robot: RobotDescription, file: CanFile) -> None:
-        self._shape = (robot.n, 2)
+        self._shape, self._period = (robot.n, 2), 1.0 / file.rate
         self.drives: tuple[Drive, ...] = make_drives(robot, file)
         self._map = MotorMap(robot, file)
         self._owners = {(drive.joint.bus, i): drive for drive in self.drives for i in drive.identifiers}
@@ -81,7 +81,7 @@ class FrameDecoder:
             self.foreign += frame.id != 0 and not 0x600 < frame.id < 0x780  # NMT, SDO and heartbeats belong to CANopen
             return None
         drive.receive(frame, time)
-        return self._states()
+        return self._states(time)
 
     def _take_command(self, place: int, frame: Frame, time: float) -> DecodedCommand | None:
         want = self.drives[place].decode_command(frame)
@@ -99,14 +99,14 @@ class FrameDecoder:
             return DecodedCommand(time, self._stated, None, self._map.joint_velocity(values))
         return DecodedCommand(time, self._stated, self._map.joint_torque(values), None)
 
-    def _states(self) -> DecodedStates | None:
+    def _states(self, now: float) -> DecodedStates | None:
         feedback = [drive.feedback for drive in self.drives]
-        if any(f.position_time <= self._since or f.velocity_time <= self._since for f in feedback):
+        if not all(newer_than(f, self._since, now, self._period) for f in feedback):
             return None
         motor = np.array([[f.position, f.velocity, f.torque] for f in feedback])
         if not np.isfinite(motor).all():
             return None
-        self._since = max(max(f.position_time, f.velocity_time) for f in feedback)
+        self._since = max(max(f.position_time, f.velocity_time, f.torque_time) for f in feedback)
         time = self._sync_time if self._synchronous else min(f.position_time for f in feedback)
         if time <= self._stated:
             return None

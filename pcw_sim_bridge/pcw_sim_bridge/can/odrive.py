@@ -38,6 +38,7 @@ ERRORS = {
 # Silence after which a message that should come by itself is missed [s].
 CYCLIC_WAIT = 0.5
 STATE_REPEAT = 0.05  # between two requests for a state [s]
+HEARTBEATS_TO_CLEAR = 5  # until which errors that were cleared must be gone
 TEMPERATURE_RATE = 25.0  # that is expected of the drive, so that heat is seen within the timeout [Hz]
 
 
@@ -127,6 +128,11 @@ class ODriveDrive(Drive):
         return range(self.node_id << 5, (self.node_id << 5) + 32)
 
     @property
+    def spoken_identifiers(self) -> Sequence[int]:
+        """What the DBC says is sent by an axis."""
+        return [self.node_id << 5 | message.frame_id for message in database().messages if message.senders == ["Axis"]]
+
+    @property
     def command_identifiers(self) -> Sequence[int]:
         """Torques and velocities."""
         return (self.node_id << 5 | self._torque.command, self.node_id << 5 | self._velocity.command)
@@ -150,7 +156,7 @@ class ODriveDrive(Drive):
         values = self._estimates.unpack(data)
         if values is None or not (math.isfinite(values[0]) and math.isfinite(values[1])):
             return False
-        self.feedback.set_position(values[0] * math.tau, now)
+        self.feedback.position, self.feedback.position_time = values[0] * math.tau, now
         self.feedback.velocity, self.feedback.velocity_time = values[1] * math.tau, now
         return True
 
@@ -158,7 +164,7 @@ class ODriveDrive(Drive):
         values = self._iq.unpack(data)
         if values is None or not math.isfinite(values[1]):
             return False
-        self.feedback.torque = values[1] * self.joint.torque_constant
+        self.feedback.torque, self.feedback.torque_time = values[1] * self.joint.torque_constant, now
         return True
 
     def _take_temperature(self, data: bytes, now: float) -> bool:
@@ -167,7 +173,7 @@ class ODriveDrive(Drive):
             return False
         known = [value for value in values if math.isfinite(value)]
         if known:
-            self.feedback.temperature = max(known)
+            self.feedback.temperature, self.feedback.temperature_time = max(known), now
         return True
 
     def _take_errors(self, data: bytes, now: float) -> bool:
@@ -182,7 +188,7 @@ class ODriveDrive(Drive):
         if values is None:
             return False
         errors, state, result, _ = values
-        self.axis_state = state
+        self.axis_state, self.feedback.state_time = state, now
         if errors:
             self._set_errors(errors)
             self.feedback.state = DriveState.FAULT
@@ -223,17 +229,18 @@ class ODriveDrive(Drive):
         self._homing_asked = False
         velocity = want.mode is Mode.VELOCITY
         control = VELOCITY_CONTROL if velocity else TORQUE_CONTROL
+        value = want.value if self.axis_state == CLOSED_LOOP and math.isfinite(want.value) else 0.0
+        wanted = self._velocity.frame(node, value / math.tau, 0.0) if velocity else self._torque.frame(node, value)
         if self._control_mode != control:
+            # The drive keeps both inputs over a change of mode: none of before may act. That of speed comes with a torque of
+            # zero, and before the mode; that of torque would be added to a speed that is held, and comes after it.
             self._control_mode = control
+            frames += [wanted] if velocity else []
             frames.append(self._mode_layout.frame(node, control, PASSTHROUGH))
         if self.axis_state != CLOSED_LOOP and not self.feedback.error_names and self._may_ask(CLOSED_LOOP, now):
-            frames.append(self._torque.frame(node, 0.0))
+            frames.append(self._velocity.frame(node, 0.0, 0.0))  # sets the input of torque to zero as well
             frames.append(self._state.frame(node, CLOSED_LOOP))
-        value = want.value if self.axis_state == CLOSED_LOOP and math.isfinite(want.value) else 0.0
-        if velocity:
-            frames.append(self._velocity.frame(node, value / math.tau, 0.0))
-        else:
-            frames.append(self._torque.frame(node, value))
+        frames.append(wanted)
         return frames
 
     def _may_ask(self, state: int, now: float) -> bool:
@@ -261,6 +268,7 @@ class ODriveDrive(Drive):
         node = self.node_id
         self.notes.clear()
         self._control_mode = 0
+        yield from self._let_go()  # whatever another computer has left on
         answer = yield self._ask("Get_Version")
         values = None if answer is None else layout("Get_Version").unpack(answer.data)
         if values is None:
@@ -276,8 +284,7 @@ class ODriveDrive(Drive):
             command = layout(message).command
             if (yield self._wait(command, message, CYCLIC_WAIT)) is None:
                 raise DriveError(f"{self.name}: {message} does not come by itself; allowed: {what} set in the drive")
-        yield from self._send(self._torque.frame(node, 0.0))
-        yield from self._send(self._state.frame(node, IDLE))
+        yield from self._let_go()
         yield from self._send(layout("Set_Limits").frame(node, self._largest_speed / math.tau, self.joint.current_limit))
         yield from self._send(self._mode_layout.frame(node, TORQUE_CONTROL, PASSTHROUGH))
         self._control_mode = TORQUE_CONTROL
@@ -287,13 +294,25 @@ class ODriveDrive(Drive):
         """Clear the errors and see that they stay away."""
         yield from self._send(layout("Clear_Errors").frame(self.node_id, 0))
         self.feedback.error_names, self.feedback.homing = (), None
-        for _ in range(2):  # the first may have been under way
+        errors = 0
+        for count in range(HEARTBEATS_TO_CLEAR):
             answer = yield self._wait(self._heartbeat.command, "Heartbeat", CYCLIC_WAIT)
-        if answer is None:
-            raise DriveError(f"{self.name}: Heartbeat does not come; allowed: heartbeat_msg_rate_ms set in the drive")
-        errors = struct.unpack_from("<I", answer.data)[0] if len(answer.data) == 8 else 0
+            if answer is None:
+                raise DriveError(f"{self.name}: Heartbeat does not come; allowed: heartbeat_msg_rate_ms set in the drive")
+            errors = struct.unpack_from("<I", answer.data)[0] if len(answer.data) == 8 else 0
+            if count and not errors:  # the first may have been under way
+                break
         if errors:
             raise DriveError(f"{self.name}: the faults {', '.join(error_names(errors))} stay after a reset; allowed: none")
+
+    def feed(self) -> list[Frame]:
+        """Return a torque of zero: some firmware wants its watchdog fed in the idle state too."""
+        return [self._torque.frame(self.node_id, 0.0)]
+
+    def _let_go(self) -> Procedure:
+        yield from self._send(self._velocity.frame(self.node_id, 0.0, 0.0))
+        yield from self._send(self._torque.frame(self.node_id, 0.0))
+        yield from self._send(self._state.frame(self.node_id, IDLE))
 
     def prepare_homing(self, method: str, speed: float, direction: float) -> Procedure:
         """Choose index search or homing on the endstop; speed and direction of both are set in the drive."""

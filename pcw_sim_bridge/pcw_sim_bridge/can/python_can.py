@@ -22,11 +22,12 @@ from .transport import BusOff, TransmitBufferFull
 
 # Frames that are taken from a bus at once, so that a flood on one leaves time for the others.
 BURST = 64
+FAILED_PAUSE = 1e-3  # [s]
 LOG_SUFFIXES = (".log", ".asc", ".blf")
 FULL = (errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK)
 
 
-def to_message(frame: Frame, channel: str | None = None, timestamp: float = 0.0) -> can.Message:
+def to_message(frame: Frame, channel: str | int | None = None, timestamp: float = 0.0) -> can.Message:
     """Return a frame as python-can has it."""
     return can.Message(
         timestamp=timestamp, arbitration_id=frame.id, is_extended_id=frame.extended, is_remote_frame=frame.remote,
@@ -70,6 +71,7 @@ class PythonCanTransport:
 
     Attributes:
         sent, received: frames by bus.
+        log_problem: why the log ended before its time; "" while it goes on. A full disk must not stop a robot.
 
     Raises:
         CanError: a bus that cannot be opened, or a log that cannot be written.
@@ -79,7 +81,9 @@ class PythonCanTransport:
         self, buses: Sequence[Bus], opened: Mapping[str, can.BusABC] | None = None, log: str | Path | None = None
     ) -> None:
         self._buses: dict[str, can.BusABC] = {}
-        self._log = None if log is None else FrameLogWriter(log)
+        self._log: FrameLogWriter | None = None
+        if log is not None:
+            check_log_suffix(Path(log))
         self._selector = selectors.DefaultSelector()
         self._polled: list[str] = []
         self._echoes = {bus.name: Echoes() for bus in buses if bus.interface == "udp_multicast"}
@@ -89,6 +93,8 @@ class PythonCanTransport:
             for bus in buses:
                 self._buses[bus.name] = (opened or {}).get(bus.name) or open_bus(bus)
                 self._watch(bus.name)
+            if log is not None:  # last, so that a bus that cannot be opened leaves no empty log
+                self._log = FrameLogWriter(log, [bus.name for bus in buses])
         except CanError:
             self.close()
             raise
@@ -98,6 +104,11 @@ class PythonCanTransport:
             self._selector.register(self._buses[name].fileno(), selectors.EVENT_READ, name)
         except (NotImplementedError, ValueError, OSError, AttributeError):
             self._polled.append(name)  # an interface without a file, such as `virtual`
+
+    @property
+    def log_problem(self) -> str:
+        """Why the log ended before its time."""
+        return "" if self._log is None else self._log.problem
 
     def now(self) -> float:
         """Return the monotonic time [s]."""
@@ -132,26 +143,26 @@ class PythonCanTransport:
         end = time.monotonic() + timeout
         while True:
             ready = self._selector.select(0.0 if self._polled or timeout <= 0.0 else max(end - time.monotonic(), 0.0))
-            for name in [key.data for key, _ in ready] + self._polled:
-                self._drain(name, arrived)
+            failed = [name for name in [key.data for key, _ in ready] + self._polled if not self._drain(name, arrived)]
+            if failed and timeout > 0.0:
+                time.sleep(min(timeout, FAILED_PAUSE))  # a bus that fails is always ready: others want the processor too
             if arrived or time.monotonic() >= end:
                 return arrived
             if self._polled:
                 time.sleep(2e-4)
 
-    def _drain(self, name: str, arrived: list[Arrived]) -> None:
+    def _drain(self, name: str, arrived: list[Arrived]) -> bool:
+        """Take what has come on a bus; False if it fails."""
         for _ in range(BURST):
             try:
                 message = self._buses[name].recv(0.0)
-            except can.CanError:
-                if name in self._echoes:
+            except Exception as error:  # each interface has its own: those of python-can, of pyserial, of usb
+                if name in self._echoes and not isinstance(error, OSError):
                     continue  # a datagram that is no frame says nothing of the bus
                 arrived.append(Arrived(name, Frame(ERROR_BUS_OFF, error=True), time.monotonic()))
-                return
-            except ValueError:  # udp_multicast: a datagram that is no frame
-                continue
+                return False
             if message is None:
-                return
+                return True
             if message.is_fd:
                 continue
             frame = to_frame(message)
@@ -161,6 +172,7 @@ class PythonCanTransport:
             arrived.append(Arrived(name, frame, time.monotonic()))
             if self._log is not None:
                 self._log.write(name, frame, time.time())
+        return True
 
     def close(self) -> None:
         """Close the buses and the log."""
@@ -216,12 +228,26 @@ class Echoes:
 class FrameLogWriter:
     """A log of frames as candump (.log), ASC or BLF, by the suffix of its path; one that exists is left as it is.
 
+    candump has names of buses; ASC and BLF have numbers, which are those in the order of `buses`. Threads may share it.
+
+    Args:
+        path: the file.
+        buses: names of the buses, in the order of the CAN file.
+
+    Attributes:
+        problem: why it ended before its time; "" while it goes on.
+
     Raises:
         CanError: another suffix, or a file that exists or cannot be written.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, buses: Sequence[str] = ()) -> None:
         path = Path(path)
+        self.problem = ""
+        self._lock = threading.Lock()
+        self._channels: dict[str, str | int] = {
+            name: name if path.suffix == ".log" else number for number, name in enumerate(buses)
+        }
         check_log_suffix(path)
         if path.exists():
             raise CanError(f"log {path} exists already and is left as it is; allowed: a new file")
@@ -233,19 +259,38 @@ class FrameLogWriter:
 
     def write(self, bus: str, frame: Frame, timestamp: float, sent: bool = False) -> None:
         """Write a frame."""
-        message = to_message(frame, bus, timestamp)
+        if self.problem:
+            return
+        message = to_message(frame, self._channels.get(bus, bus), timestamp)
         message.is_rx = not sent
-        self._logger(message)
+        with self._lock:
+            try:
+                self._logger(message)
+            except (OSError, ValueError, struct.error) as error:
+                self.problem = f"the log ended: {error}"
 
     def close(self) -> None:
         """Close the file."""
-        self._logger.stop()
+        try:
+            self._logger.stop()
+        except (OSError, ValueError, struct.error) as error:
+            self.problem = self.problem or f"the log ended: {error}"
 
 
 def check_log_suffix(path: Path) -> None:
     """Refuse a log that is neither candump nor ASC nor BLF."""
     if path.suffix not in LOG_SUFFIXES:
         raise CanError(f"log {path}: the suffix {path.suffix!r} is not allowed; allowed: {', '.join(LOG_SUFFIXES)}")
+
+
+def free_log_name(path: str | Path) -> Path:
+    """Return the path, or NAME_2.SUFFIX, NAME_3.SUFFIX ... where it exists: each configure of a driver has its own log."""
+    given = path = Path(path)
+    number = 1
+    while path.exists():
+        number += 1
+        path = given.with_stem(f"{given.stem}_{number}")
+    return path
 
 
 def read_log(path: str | Path) -> Iterator[tuple[str, Frame, float]]:
@@ -257,7 +302,8 @@ def read_log(path: str | Path) -> Iterator[tuple[str, Frame, float]]:
     path = Path(path)
     check_log_suffix(path)
     try:
-        with can.LogReader(str(path)) as reader:
+        # Of ASC the times of the day, not since its beginning, as the others have them.
+        with can.LogReader(str(path), **({"relative_timestamp": False} if path.suffix == ".asc" else {})) as reader:
             for message in reader:
                 if not message.is_fd:
                     yield str(message.channel), to_frame(message), message.timestamp

@@ -6,7 +6,7 @@ as a frame on the way.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,8 @@ from .can_file import CanFile
 from .can_robot import CanRobot, TimedReading
 from .emulated_robot import EmulatedRobot, EmulatedTransport
 from .errors import CanError
-from .frame_log import FrameDecoder, write_joint_topics
+from .frame import Frame
+from .frame_log import FrameDecoder, frames_of_file, write_joint_topics
 
 START_NS = 1_000_000_000
 
@@ -37,8 +38,11 @@ def record_run_over_can(
     path: str | Path,
     controlled_as: RobotDescription | None = None,
     controller_name: str = "computed_torque",
+    log: str | Path | None = None,
 ) -> None:
     """Drive a robot over emulated CAN and write the recording; see `simulated_run.record_run` for the arguments.
+
+    With `log` the frames are written to this file, .log, .asc or .blf, and the joints' topics are made of what it holds.
 
     Raises:
         CanError: a fault stopped the robot.
@@ -65,7 +69,8 @@ def record_run_over_can(
             samples.append(("/imu/data", imu(now, reading.angular_velocity, reading.linear_acceleration), now))
 
     transport = EmulatedTransport(emulated, on_step)
-    can, controller = CanRobot(robot, file, transport), make_controller(controller_name, controlled_as or robot)
+    believed = controlled_as or robot
+    can, controller = CanRobot(believed, file, transport), make_controller(controller_name, believed)
     can.configure()
     can.enable()
     frames = transport.log()
@@ -84,10 +89,31 @@ def record_run_over_can(
         can.cycle(answer)
         if can.faults:
             raise CanError("; ".join(map(str, can.faults)))
+    heard: Iterable[tuple[str, Frame, float]] = ((bus, frame, time) for bus, frame, time, _ in frames)
+    if log is not None:
+        heard = _through_log(frames, file, log)
     with RecordingWriter(path, flush_interval=None) as writer:
-        decoder = FrameDecoder(robot, file)
+        decoder = FrameDecoder(believed, file)
         for topic, message, now in samples:
             writer.write(topic, message, now)
-        write_joint_topics(writer, robot, decoder, ((bus, frame, time) for bus, frame, time, _ in frames), START_NS)
+        write_joint_topics(writer, believed, decoder, heard, START_NS)
     can.close()
     emulated.close()
+
+
+def _through_log(
+    frames: list[tuple[str, Frame, float, bool]], file: CanFile, log: str | Path
+) -> Iterator[tuple[str, Frame, float]]:
+    """Write frames to a log and yield what it holds, at the simulated time: a log may count from its own beginning."""
+    from .python_can import FrameLogWriter, read_log
+
+    written = FrameLogWriter(log, [bus.name for bus in file.buses])
+    for bus, frame, time, sent in frames:
+        written.write(bus, frame, time + START_NS * 1e-9, sent)
+    written.close()
+    if written.problem:
+        raise CanError(written.problem)
+    shift = None
+    for bus, frame, time in frames_of_file(read_log(log), file):
+        shift = frames[0][2] - time if shift is None else shift
+        yield bus, frame, time + shift

@@ -1,6 +1,7 @@
 """What the CAN part is worth, in simulated time: faults, random frames, the analyser's verdict, and the load of buses.
 
     python -m pcw_sim_bridge.can.trials faults [--times 20] [--seed 0]
+    python -m pcw_sim_bridge.can.trials encoders [--times 20] [--seed 0]
     python -m pcw_sim_bridge.can.trials fuzz [--frames 100000] [--seed 0]
     python -m pcw_sim_bridge.can.trials verdict --out DIR
     python -m pcw_sim_bridge.can.trials loads
@@ -14,35 +15,24 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pcw_control.excitation import make_excitation
 from pcw_description.errors import PcwError
 from pcw_description.robot_description import DRIVE, RobotDescription
 from pcw_description.robot_file import load_robot
 
-from ..plants.factory import make_plant
-from ..simulate import added_physics
-from ..simulated_robot import JointCommand
-from ..simulated_run import record_run
-from .can_file import CanFile, joint_place, read_can_file
-from .can_robot import CanRobot, TimedReading
-from .drive_emulator import FaultTimer
+from .can_file import CanFile, read_can_file
 from .drive_set import bus_loads, make_drives
-from .emulated_robot import EmulatedRobot, EmulatedTransport
+from .encoder_trials import run_encoders
 from .errors import CanError
 from .frame import Arrived, Frame
-from .simulated_can_run import record_run_over_can
-from .transport import TransmitBufferFull
+from .trial_rig import ALLOWED_MS, FILES, Rig
 
-FILES = ("thesis_cia402", "thesis_odrive")
-ALLOWED_MS = 50.0
 # What is done, where, and the names by which the driver may say it. "computer" is done to the driver's end.
 FAULT_TRIALS = (
     ("dead", "joint", ("missing_node",)),
@@ -51,7 +41,8 @@ FAULT_TRIALS = (
     ("hot", "joint", ("over_temperature",)),
     ("over_current", "joint", ("over_current",)),
     ("encoder_jump", "joint", ("encoder_jump",)),
-    ("encoder_stuck", "drive joint", ("encoder_stuck", "encoder_jump")),
+    ("encoder_stuck", "turning joint", ("encoder_stuck", "encoder_jump")),
+    ("encoder_dead", "turning joint", ("encoder_stuck", "encoder_jump")),
     ("over_torque", "joint", ("over_current", "torque_limit")),
     ("restart", "joint", ("node_reset", "drive_disabled")),
     ("bus_off", "bus", ("bus_off",)),
@@ -59,70 +50,24 @@ FAULT_TRIALS = (
     ("transmit_buffer_full", "computer", ("transmit_buffer_full",)),
     ("driver_killed", "computer", ()),
 )
-# An encoder that stands shows in motion alone; at this speed of the joint it must [rad/s].
-STUCK_SPEED = 1.5
+# An encoder that stands shows in motion alone, and the faster the sooner (`encoder_trials`): at this speed it must [rad/s].
+STUCK_SPEED = 1.0
 DETECTED_BY_DRIVE_ALONE = {("hot", "cia402")}  # the profile has no object for a temperature
-
-
-class Rig:
-    """A driver's core on emulated drives, with a timer and a bus that can be full."""
-
-    def __init__(self, robot: RobotDescription, file: CanFile, seed: int = 0) -> None:
-        self.robot = robot
-        self.emulated = EmulatedRobot(make_plant("reduced", robot), file, seed)
-        self.timer = FaultTimer(self.emulated)
-        self.transport = ClosableTransport(self.emulated, self.timer.on_step)
-        self.can = CanRobot(robot, file, self.transport)
-        self.torque = np.zeros((robot.n, 2))
-
-    def answer(self, reading: TimedReading) -> None:
-        """Command the torque to a reading, gently braked so that speeds stay low."""
-        effort = self.torque - 0.05 * reading.joints.velocity * (self.torque != 0.0)
-        self.can.command(JointCommand(effort=effort), reading.time)
-
-    def cycles(self, count: int, answered: bool = True) -> None:
-        """Do periods."""
-        for _ in range(count):
-            self.can.cycle(self.answer if answered else None)
-
-
-class ClosableTransport(EmulatedTransport):
-    """An emulated bus whose transmit buffer can be full, and on which other frames can come too."""
-
-    def __init__(self, emulated: EmulatedRobot, on_step: Callable[[float], object] | None = None) -> None:
-        super().__init__(emulated, on_step)
-        self.full = False
-        self.sent: list[tuple[str, Frame]] | None = None
-        self.others: list[Arrived] = []
-
-    def send(self, bus: str, frame: Frame) -> None:
-        """Give a frame to the drives, or be full."""
-        if self.full:
-            raise TransmitBufferFull(f"{bus}: transmit buffer full")
-        if self.sent is not None:
-            self.sent.append((bus, frame))
-        super().send(bus, frame)
-
-    def receive(self, timeout: float) -> list[Arrived]:
-        """Return what the drives and the others say."""
-        others, self.others = self.others, []
-        return [one._replace(time=self.now()) for one in others] or super().receive(timeout)
 
 
 def fault_trial(rig: Rig, fault: str, kind: str, names: Sequence[str], rng: np.random.Generator) -> dict[str, Any]:
     """Do one fault while driving; returns when the torque was zero, by what name, and whether it stayed off."""
     can, emulated, timer = rig.can, rig.emulated, rig.timer
-    drives = [d.name for d in can.drives if kind != "drive joint" or d.name.endswith("_drive")]
-    where = str(rng.choice(drives)) if "joint" in kind else can.file.buses[0].name
-    rig.torque = np.zeros((rig.robot.n, 2))
-    rig.torque[:, DRIVE] = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.0)
+    where = str(rng.choice([d.name for d in can.drives])) if "joint" in kind else can.file.buses[0].name
     can.enable()
+    rig.wander(float(rng.uniform(2.0, 40.0)))
     rig.cycles(int(rng.integers(20, 250)))
     assert can.armed and np.abs(emulated.motor_torques()).max() > 0.0
-    if fault == "encoder_stuck":
-        place = joint_place(rig.robot, where)
-        while can.reading is None or abs(can.reading.joints.velocity[place]) < STUCK_SPEED:
+    if kind == "turning joint":
+        while can.reading is None or np.abs(can.reading.joints.velocity).max() < STUCK_SPEED:
             rig.cycles(1)
+        turning = np.abs(can.reading.joints.velocity).ravel() >= STUCK_SPEED
+        where = str(rng.choice(np.array(rig.robot.joint_names)[turning]))
     rig.transport.receive(float(rng.uniform(0.0, can.period)))  # at any time within a period
     begun = emulated.time
     if kind == "computer":
@@ -294,40 +239,7 @@ def _some_frames(rig: Rig) -> list[tuple[str, Frame, float, bool]]:
     return frames
 
 
-# --- The analyser ----------------------------------------------------------------------------------------
-
-VERDICT_CASES = (("healthy", ""), ("friction", "{name: drive_coulomb_friction, target: [front_left], coulomb: 0.8}"))
-
-
-def run_verdict(out: Path, seed: int, can_file: str = FILES[0]) -> tuple[str, bool]:
-    """Analyse recordings over CAN and of the bridge's robot, healthy and not; returns a table and whether they agree."""
-    from ..mismatch.__main__ import main as mismatch
-
-    believed = load_robot("thesis")
-    file = read_can_file(can_file, believed)
-    lines, fine = [], True
-    for case, physics in VERDICT_CASES:
-        effects = added_physics(physics, believed.caster_names) if physics else ()
-        robot = dataclasses.replace(believed, physics=effects)
-        excitation = make_excitation("figure8", believed, 30.0, seed)
-        verdicts = {}
-        for way in ("can", "bridge"):
-            path = out / f"{case}_{way}"
-            if way == "can":
-                record_run_over_can(robot, file, excitation.twist, 30.0, seed, path, believed)
-            else:
-                record_run(robot, excitation.twist, 30.0, seed, path, controlled_as=believed)
-            report = out / f"{case}_{way}_report"
-            if mismatch(["analyze", str(path), "--robot", "thesis", "--out", str(report), "--quiet"]) != 0:
-                return f"{path} was not analysed", False
-            found = json.loads((report / "report.json").read_text(encoding="utf-8"))
-            verdicts[way] = (found["verdict"], sorted((e["name"], *e["target"]) for e in found["effects"]))
-            numbers = [f"{e['name']} {' '.join(e['target'])} "
-                       + ", ".join(f"{key} = {value['value']:.4g}" for key, value in e["parameters"].items())
-                       for e in found["effects"]]  # fmt: skip
-            lines.append(f"{case:10} {way:7} {found['verdict']:12} {'; '.join(numbers)}")
-        fine = fine and verdicts["can"] == verdicts["bridge"]
-    return "\n".join(lines), fine
+# --- Loads -----------------------------------------------------------------------------------------------
 
 
 def run_loads() -> str:
@@ -346,12 +258,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line: exit 0 when all is as it must be, 1 when not, 2 on bad input."""
     options = argparse.ArgumentParser(prog="can.trials", description="Faults, random frames, verdicts and loads over CAN.")
     actions = options.add_subparsers(dest="action", required=True)
-    for action in ("faults", "fuzz", "verdict", "loads"):
-        sub = actions.add_parser(action)
-        sub.add_argument("--seed", type=int, default=0)
+    for action, what in (("faults", "every fault while driving, in simulated time"),
+                         ("encoders", "how soon an encoder that stands is found, and false alarms"),
+                         ("fuzz", "random and mutated frames"), ("verdict", "the analyser over CAN and over the bridge"),
+                         ("loads", "the load of the shipped files")):  # fmt: skip
+        sub = actions.add_parser(action, help=what, description=what)
+        sub.add_argument("--seed", type=int, default=0, help="of everything that is drawn (default: 0)")
         sub.add_argument("--into", type=Path, metavar="PAGE", help="write the table into a page, between its marks")
-        if action == "faults":
-            sub.add_argument("--times", type=int, default=20, help="each fault, with each protocol (default: 20)")
+        if action in ("faults", "encoders"):
+            sub.add_argument("--times", type=int, default=20, help="each, with each protocol (default: 20)")
         elif action == "fuzz":
             sub.add_argument("--frames", type=int, default=100_000, help="in all (default: 100000)")
         elif action == "verdict":
@@ -362,20 +277,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
             said, fine = run_loads(), True
         elif given.action == "faults":
             said, fine = run_faults(given.times, given.seed)
+        elif given.action == "encoders":
+            said, fine = run_encoders(given.times, given.seed)
         elif given.action == "fuzz":
             said, fine = run_fuzz(given.frames, given.seed)
         else:
+            from .verdict_trials import run_verdict
+
             said, fine = run_verdict(given.out, given.seed)
     except PcwError as error:
         print(f"can.trials: {error}", file=sys.stderr)
         return 2
     print(said)
     if given.into is not None:
-        _write_into(given.into, given.action, said)
+        write_into(given.into, given.action, said)
     return 0 if fine else 1
 
 
-def _write_into(page: Path, mark: str, table: str) -> None:
+def write_into(page: Path, mark: str, table: str) -> None:
     """Replace what stands between `<!-- MARK -->` and `<!-- /MARK -->` of a page."""
     head, opening, rest = page.read_text(encoding="utf-8").partition(f"<!-- {mark} -->\n")
     _, closing, tail = rest.partition(f"<!-- /{mark} -->")

@@ -40,6 +40,8 @@ from .whitened_regression import Fit, predicted
 Progress = Callable[[str], None]
 
 FLAG_PROBABILITY = 1e-3
+# The scraps between shaking are no sample of the motion: they look like every kind of effect.
+LEAST_UNDISTURBED = 0.2
 # Least to say anything: usable samples per channel and unknown, and time of usable motion.
 LEAST_DURATION = 5.0  # [s]
 # A number of the description is reported where it moves by this many of its own standard errors and a tenth of its
@@ -86,11 +88,16 @@ def analyse(
     progress(f"building the channels{once}")
     problem = subject.problem(opened)
     inputs = tuple(o.finding for o in (*opened, *held_out))
-    usable = float(problem.valid.any(axis=1).sum()) / problem.rate
-    if usable < LEAST_DURATION:
-        note = f"only {usable:.1f} s of usable motion (moving, no gross slip); at least {LEAST_DURATION:g} s are needed"
+    judged = problem.valid.any(axis=1)
+    usable = float(judged.sum()) / problem.rate
+    if usable < LEAST_DURATION or (problem.remarks and judged.mean() < LEAST_UNDISTURBED):
+        note = (
+            f"only {usable:.1f} s of usable motion (moving, no gross slip), {100 * judged.mean():.0f} % of what was recorded; "
+            f"at least {LEAST_DURATION:g} s are needed, and {100 * LEAST_UNDISTURBED:.0f} % where wheels shake"
+        )
+        notes = (note, *problem.remarks)
         empty = Findings(
-            subject.name, "insufficient_data", inputs, (), (), (), (), (), None, (), (), (note,), time.monotonic() - begun
+            subject.name, "insufficient_data", inputs, (), (), (), (), (), None, (), (), notes, time.monotonic() - begun
         )
         return Analysis(empty, subject)
     samples, channels = problem.residual.shape
@@ -306,6 +313,7 @@ def _notes(
     for label, variable in explanation.withdrawn:
         notes.append(f"{label} was withdrawn: what is left depends on {variable}, which that effect does not.")
     notes.extend(explanation.remarks)
+    notes.extend(problem.remarks)
     for number in retuned:
         if abs(number.value - number.nominal) > 3.0 * number.tolerance:
             times = abs(number.value - number.nominal) / number.tolerance

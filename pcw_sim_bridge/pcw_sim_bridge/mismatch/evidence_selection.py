@@ -36,12 +36,14 @@ from .regression_problem import (
     segment_slices,
 )
 from .selection_settings import SelectionSettings
+from .shape_search import refined_shape
 from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression
 
 Progress = Callable[[str], None]
 # So many times the problem is made exact where its fit came out, or this part of the way there.
 EXACT_ROUNDS = 6
 STEPS = (1.0, 0.5, 0.2)
+RESHAPINGS = 3  # the first under the noise that a wrong shape leaves, which makes shapes alike
 GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
 SPLIT_AMONG = 12  # candidates that a term may have taken in
 GATHERED_AMONG = 2  # candidates that several terms may be parts of
@@ -148,7 +150,7 @@ class EffectSearch:
 
         What their first order leaves would pass for other effects. A step that leaves more than there was is halved.
         """
-        reshaped = False
+        reshapings = 0
         for count in range(EXACT_ROUNDS):
             known = self.problem.point is not None and self.problem.point.derived
             if count == (2 * DERIVED_FROM if known else DERIVED_FROM):
@@ -160,24 +162,31 @@ class EffectSearch:
             for part in STEPS:
                 if not self._exact_at(fit, part):
                     return instances
-                again = instances if reshaped else self._reshaped(instances, residual)
+                again = instances if reshapings == RESHAPINGS else self._reshaped(instances, residual, reshapings == 0)
                 left, cost = self._left_and_cost(again)
                 if self._error(left, residual) + 2.0 * cost <= allowed:
                     break
                 self.problem, self._point = before
             else:
                 return instances
-            instances, reshaped = again, True
+            reshapings = RESHAPINGS if again == instances else reshapings + 1
+            instances = again
         return instances
 
-    def _reshaped(self, instances: tuple[Instance, ...], residual: FloatArray) -> tuple[Instance, ...]:
-        """Search the shapes again of what is at work once."""
+    def _reshaped(self, instances: tuple[Instance, ...], residual: FloatArray, coarse: bool) -> tuple[Instance, ...]:
+        """Search the shapes again, near where they are; coarse: of what is at work once also as far as its neighbours."""
         regression = self.whiten_at(residual)
         for index, instance in enumerate(instances):
-            if self.problem.terms[instance.term].once:
-                others = (*instances[:index], *instances[index + 1 :])
-                found = self.refine_shape(regression, others, instance)
-                instances = (*instances[:index], found, *instances[index + 1 :])
+            term = self.problem.terms[instance.term]
+            if not term.resolution:
+                continue
+            others = (*instances[:index], *instances[index + 1 :])
+            around = self.problem.around(instance.term, instance.shape)
+            near = regression if around is self.problem else regression.moved(around)
+            found = refined_shape(near, others, instance, coarse and term.once)
+            if found != instance:
+                self.problem, regression = around, near
+            instances = (*instances[:index], found, *instances[index + 1 :])
         return instances
 
     def _exact_at(self, fit: Fit, part: float = 1.0) -> bool:
@@ -270,7 +279,7 @@ class EffectSearch:
                 continue
             if sum(i.term == step.instance.term for i in instances) >= self.settings.first_repeats:
                 break
-            instances = (*instances, self.refine_shape(regression, instances, step.instance))
+            instances = (*instances, refined_shape(regression, instances, step.instance))
             instances = self.improve(regression, instances)
             left = regression.unwhitened_residual(regression.fit(instances))
             regression.rescale(channel_deviations(left, self.problem.valid))
@@ -311,7 +320,7 @@ class EffectSearch:
             step = self.best_addition(regression, instances)
             if step is None or step.gain < least_gain:
                 break
-            instances = (*instances, self.refine_shape(regression, instances, step.instance))
+            instances = (*instances, refined_shape(regression, instances, step.instance))
             self.progress(f"+ {self.label(instances[-1])}: gain {step.gain:.1f} nats")
             self.ladder.append(LadderStep(f"add {self.label(instances[-1])}", step.gain, None, "tried"))
             if not settling:
@@ -349,34 +358,6 @@ class EffectSearch:
                 return True
         return False
 
-    def refine_shape(
-        self, regression: WhitenedRegression, others: Sequence[Instance], instance: Instance
-    ) -> Instance:
-        """Local search of the shaping parameters between the neighbours on the grid, one after the other."""
-        term = self.problem.terms[instance.term]
-        for name, (kind, spacing) in term.resolution.items():
-            width = math.log(spacing) if kind == "log" else spacing
-            before = -math.inf
-            for _ in range(2 if kind == "log" else 6):
-                best, best_evidence = instance, -math.inf
-                for offset in np.linspace(-1.0, 1.0, 7):
-                    shape = dict(instance.shape)
-                    shape[name] = (
-                        shape[name] * math.exp(offset * width)
-                        if kind == "log"
-                        else shape[name] + offset * width
-                    )
-                    trial = regression.with_shape(instance, shape)
-                    evidence = regression.fit([*others, trial]).log_evidence
-                    if evidence > best_evidence:
-                        best, best_evidence = trial, evidence
-                instance = best
-                width *= 0.4
-                if best_evidence < before + 0.2:
-                    break
-                before = best_evidence
-        return instance
-
     def improve(
         self, regression: WhitenedRegression, instances: tuple[Instance, ...]
     ) -> tuple[Instance, ...]:
@@ -401,7 +382,7 @@ class EffectSearch:
         """The first exchange or removal that raises the evidence by more than half a nat, if any."""
         for others, wider in gatherings(self.problem, instances):
             for candidate in regression.scan(others, only=wider)[0][:GATHERED_AMONG]:
-                gathered = (*others, self.refine_shape(regression, others, candidate.instance))
+                gathered = (*others, refined_shape(regression, others, candidate.instance))
                 trial = regression.fit(gathered)
                 if trial.log_evidence > fit.log_evidence + 0.5 and regression.within_bounds(trial):
                     return f"gather into {self.label(gathered[-1])}", gathered
@@ -416,7 +397,7 @@ class EffectSearch:
                     continue
                 if self.repeats(candidate.instance, others):
                     continue
-                refined = self.refine_shape(regression, others, candidate.instance)
+                refined = refined_shape(regression, others, candidate.instance)
                 trial = regression.fit([*others, refined])
                 if trial.log_evidence > fit.log_evidence + 0.5 and regression.within_bounds(trial):
                     return f"exchange {self.label(instance)} for {self.label(refined)}", (*others, refined)
@@ -450,7 +431,7 @@ class EffectSearch:
             split = (
                 *others,
                 candidate.instance,
-                self.refine_shape(regression, [*others, candidate.instance], again[0].instance),
+                refined_shape(regression, [*others, candidate.instance], again[0].instance),
             )
             trial = regression.fit(split)
             if (

@@ -31,16 +31,15 @@ from .evidence_selection import EffectSearch, Progress, Selection
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
 from .regression_problem import FloatArray, RegressionProblem, Term
 from .selection_settings import SelectionSettings
+from .shape_search import refined_shape, shape_interval
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
 AMBIGUOUS = 3.0
 # What a refinement of a named effect has to make up for against a further plain effect: the plain laws come first.
 REFINEMENT_LOG_PRIOR = -3.0
-# 95 % of a Gaussian: half-width in deviations, and drop of the log likelihood.
-HALF_WIDTH, DROP = 1.96, 1.92
-# Widest profile interval of a shaping parameter that is searched on a logarithmic scale.
-WIDEST_RATIO = 30.0
+# Half-width of 95 % of a Gaussian, in deviations.
+HALF_WIDTH = 1.96
 
 
 @dataclasses.dataclass(frozen=True)
@@ -375,12 +374,14 @@ def _estimates(problem: RegressionProblem, fit: Fit) -> list[FloatArray]:
 def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, ...]:
     """Numbers, intervals, probability and look-alikes of every effect of a selection."""
     problem, regression, fit = search.problem, selection.regression, selection.fit
-    deviation = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    variance = np.maximum(np.diag(fit.covariance), 1e-300)
+    widening = np.maximum(np.diag(regression.misfit_covariance(fit)) / variance, 1.0)
+    deviation = np.sqrt(variance * widening)
     position = len(problem.nuisances)
     named = []
     for index, instance in enumerate(fit.instances):
         term = problem.terms[instance.term]
-        estimates = {}
+        estimates, active = {}, len(instance.active)
         for offset, parameter_index in enumerate(instance.active):
             parameter = term.parameters[parameter_index]
             if parameter.hidden:
@@ -392,12 +393,14 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             low, high = parameter.interval(value - half, value + half)
             estimates[parameter.name] = Estimate(parameter.value(value), parameter.unit, low, high)
         others = fit.instances[:index] + fit.instances[index + 1 :]
+        around = problem.around(instance.term, instance.shape)
+        near = regression if around is problem else regression.moved(around)
         for name, value in instance.shape:
-            low, high = _profile(regression, others, instance, name, fit.log_evidence, term.resolution)
+            low, high = shape_interval(near, others, instance, name, float(widening[position : position + active].max()))
             estimates[name] = Estimate(value, "", low, high)
         columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
-        contribution = columns @ fit.mean[position : position + len(instance.active)]
-        position += len(instance.active)
+        contribution = columns @ fit.mean[position : position + active]
+        position += active
         probability, alike = _alternatives(search, selection, index)
         named.append(
             NamedTerm(
@@ -439,44 +442,6 @@ def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
     return tuple(doubted)
 
 
-def _profile(
-    regression: WhitenedRegression,
-    others: tuple[Instance, ...],
-    instance: Instance,
-    name: str,
-    best: float,
-    resolution: Mapping[str, tuple[str, float]],
-) -> tuple[float, float]:
-    """95 % interval of a shaping parameter by its profile likelihood: on the scale that it was searched on, or as it is."""
-    centre = dict(instance.shape)[name]
-    kind, spacing = resolution.get(name, ("", 0.0))
-    if not kind or (kind == "log" and centre <= 0.0):
-        return centre, centre
-    widest = math.log(WIDEST_RATIO) if kind == "log" else 2.0 * spacing
-    smallest = 1e-4 if kind == "log" else 1e-4 * spacing
-
-    def moved(step: float) -> float:
-        return centre * math.exp(step) if kind == "log" else centre + step
-
-    def drop(step: float) -> float:
-        shape = {**dict(instance.shape), name: moved(step)}
-        return best - regression.fit([*others, regression.with_shape(instance, shape)]).log_evidence
-
-    ends = []
-    for direction in (-1.0, 1.0):
-        inner, outer = 0.0, smallest
-        while outer < widest and drop(direction * outer) < DROP:
-            inner, outer = outer, outer * 3.0
-        for _ in range(5):
-            middle = math.sqrt(inner * outer) if inner > 0.0 else 0.5 * outer
-            if drop(direction * middle) < DROP:
-                inner = middle
-            else:
-                outer = middle
-        ends.append(moved(direction * min(outer, widest)))
-    return ends[0], ends[1]
-
-
 def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tuple[float, tuple[str, ...]]:
     """Probability of an instance among the sets without it or with another term instead, and its look-alikes."""
     problem, regression, fit = search.problem, selection.regression, selection.fit
@@ -500,13 +465,16 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
             or without.log_evidence + candidate.gain < fit.log_evidence - 30.0
         ):
             continue
-        trial = regression.fit([*others, candidate.instance])
+        # With the shape that suits it best, as the named one has: those of its grid would lose however alike the two are.
+        trial = regression.fit([*others, refined_shape(regression, others, candidate.instance)])
         if not regression.within_bounds(trial):
             continue
-        difference = without.log_evidence + candidate.gain - fit.log_evidence
+        mine, theirs = problem.terms[own.term], problem.terms[candidate.instance.term]
+        difference = trial.log_evidence - fit.log_evidence
+        if not (mine.once or theirs.once):  # what happens once is in one piece of the recording
+            difference = regression.log_odds(trial, fit)
         rivals.append(difference)
         if difference > -AMBIGUOUS:
-            mine, theirs = problem.terms[own.term], problem.terms[candidate.instance.term]
             alike.append(theirs.effect if theirs.effect != mine.effect else theirs.key)
     total = sum(math.exp(min(rival, 50.0)) for rival in rivals)
     return 1.0 / (1.0 + total), tuple(alike)

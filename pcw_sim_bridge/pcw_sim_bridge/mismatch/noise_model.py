@@ -28,6 +28,8 @@ LONGEST_FILTER = 24
 # Periodogram ordinates averaged for the slowest noise: enough that the mean is good to a third, few enough to see a drift.
 SLOW_ORDINATES = 8
 _SPECTRUM_POINTS = 512
+# In SI units, below the noise of every sensor: a recording of an ideal simulation may leave nothing at all.
+LEAST_DEVIATION = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,18 +131,18 @@ def huber_weights(standardised: FloatArray) -> FloatArray:
 
 
 def robust_deviation(values: FloatArray) -> float:
-    """Standard deviation with Huber weights around zero, started at the median absolute value."""
+    """Standard deviation with Huber weights around zero, started at the median absolute value; at least `LEAST_DEVIATION`."""
     if len(values) == 0:
         return 1.0
     deviation = 1.4826 * float(np.median(np.abs(values)))
     if deviation <= 0.0:
         deviation = float(np.sqrt(np.mean(values**2)))
-    if deviation <= 0.0:
-        return 1e-300
+    if deviation <= LEAST_DEVIATION:
+        return LEAST_DEVIATION
     for _ in range(3):
         weight = huber_weights(values / deviation)
         deviation = float(np.sqrt(np.sum(weight * values**2) / np.sum(weight)))
-    return max(deviation, 1e-300)
+    return max(deviation, LEAST_DEVIATION)
 
 
 def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -> NoiseModel:

@@ -185,6 +185,18 @@ class Point:
 
 
 @dataclasses.dataclass(frozen=True)
+class _NearSecant:
+    """Columns of a term by its derivatives: times `factor` (P,), and `rest` (T, C, P)."""
+
+    factor: FloatArray
+    rest: FloatArray
+
+    def column(self, slope: FloatArray) -> FloatArray:
+        """Return the columns (T, C, P) for derivatives (T, C, P)."""
+        return self.factor * slope + self.rest
+
+
+@dataclasses.dataclass(frozen=True)
 class Sites:
     """Where a torque or force may act that no effect of the library describes.
 
@@ -226,6 +238,8 @@ class RegressionProblem:
         nominal: residual of the description as it is, where `residual` is exact elsewhere; point: where.
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
+        remarks: what a reader has to know of the recordings.
+        near: how columns of a term follow from its derivatives, by term; see `around`.
     """
 
     channels: tuple[Channel, ...]
@@ -247,6 +261,8 @@ class RegressionProblem:
     nominal: FloatArray | None = None
     point: Point | None = None
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    near: Mapping[int, _NearSecant] = dataclasses.field(default_factory=dict)
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -272,8 +288,31 @@ class RegressionProblem:
     def columns(self, term: int, shape: tuple[tuple[str, float], ...]) -> FloatArray:
         """Columns (T, C, P) of one term at one shape, computed once."""
         if (term, shape) not in self._remembered:
-            self._remembered[term, shape] = self.terms[term].columns(dict(shape))
+            found = self.terms[term].columns(dict(shape))
+            self._remembered[term, shape] = self.near[term].column(found) if term in self.near else found
         return self._remembered[term, shape]
+
+    def around(self, term: int, shape: tuple[tuple[str, float], ...]) -> RegressionProblem:
+        """Return the problem with columns of a term that may be compared with its secant at the shape where it is exact.
+
+        Elsewhere a column is a derivative, and against a secant each of these would lose, however little its shape differs.
+        They get what the secant has over the derivative: the factor of a law of another power, and what that leaves, which is
+        right near the shape.
+        """
+        if self.point is None or (term, shape) not in {(size.term, size.shape) for size in self.point.sizes}:
+            return self
+        secant, slope = self.columns(term, shape), self.terms[term].columns(dict(shape))
+        if np.array_equal(secant, slope):
+            return self
+        factor = np.sum(secant * slope, axis=(0, 1)) / np.maximum(np.sum(slope**2, axis=(0, 1)), 1e-300)
+        moved = dataclasses.replace(self, near={**self.near, term: _NearSecant(factor, secant - factor * slope)})
+        moved._remembered.update(self._without(term))
+        moved._remembered[term, shape] = secant
+        return moved
+
+    def _without(self, *terms: int) -> dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray]:
+        """Columns that were computed, except those of these terms."""
+        return {key: columns for key, columns in self._remembered.items() if key[0] not in terms}
 
     def with_terms(self, terms: Sequence[Term]) -> RegressionProblem:
         """Return the problem with further terms after its own; columns that were computed are kept."""
@@ -318,9 +357,10 @@ class RegressionProblem:
             residual=residual,
             nominal=self.nominal_residual,
             powers=powers,
+            near={},
             point=Point(dict(changes), tuple(sizes), self.point is not None and self.point.derived),
         )
-        moved._remembered.update(self._remembered)
+        moved._remembered.update(self._without(*self.near))
         moved._remembered.update(columns)
         return moved
 

@@ -46,6 +46,8 @@ SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 SLIP_DEVIATION = 0.3
 SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
+SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slips to and fro is less than at its average slip
+SHAKEN_PART = 0.05  # of the samples in which wheels shake is worth a word
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
 
@@ -130,6 +132,7 @@ class RobotProblemBuilder:
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
             exact=functools.partial(self._exact, differences, terms),
             derive=functools.partial(self._derive, differences, terms),
+            remarks=self._remarks(),
         )
 
     def _exact(
@@ -217,7 +220,7 @@ class RobotProblemBuilder:
         return found
 
     def _valid(self, differences: ChannelDifferences) -> BoolArray:
-        """Samples (T, C) that the rolling model can judge: moving, no gross slip, sensor there."""
+        """Samples (T, C) that the rolling model can judge: moving, no gross slip or shaking, sensor there."""
         pieces = []
         numbers = self.numbers
         reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
@@ -230,6 +233,7 @@ class RobotProblemBuilder:
             if not self.layout.redundant:
                 rolled = at_place(twist, numbers.tracked)
                 bad = sudden_slip(motion.tracked_twist, rolled, motion.rate, reach, allowed)
+            bad = bad | (motion.shaking > SHAKING_PART * allowed)
             # What a filter makes of forces that no model follows reaches beyond the slip itself.
             reach_of_filter = round(RINGING * motion.rate / self.cutoff)
             bad = ndimage.binary_dilation(bad, iterations=max(reach_of_filter, 1))
@@ -237,6 +241,19 @@ class RobotProblemBuilder:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
             pieces.append((bad[:, None] | ~known).astype(float))
         return differences.filtered(pieces) < 0.1
+
+    def _remarks(self) -> tuple[str, ...]:
+        """What keeps samples from being judged that a user can mend."""
+        shaken = np.concatenate([motion.shaking > SHAKING_PART * SLIP_FLOOR for motion in self.motions])
+        if np.mean(shaken) < SHAKEN_PART:
+            return ()
+        worst = max(self.motions, key=lambda motion: float(np.mean(motion.shaking)))
+        frequency, speed = worst.shaking_frequency, float(np.quantile(worst.shaking, 0.95))
+        return (
+            f"In {100 * np.mean(shaken):.0f} % of the samples wheels shake at about {frequency:.0f} Hz, by up to "
+            f"{speed:.2f} m/s at the ground, and were not judged. A loop of the drives may be too stiff for the tyres and the "
+            "delay: lower its gains and record anew.",
+        )
 
     def _along_motions(self, differences: ChannelDifferences) -> dict[str, list[FloatArray]]:
         """What a leftover may depend on, one array per motion."""

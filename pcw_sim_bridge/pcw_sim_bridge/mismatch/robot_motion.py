@@ -13,6 +13,7 @@ from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
 from .held_commands import quiet_torque
 from .regression_problem import BoolArray, FloatArray
 from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
+from .wheel_shaking import wheel_shaking
 
 LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
 SMALLEST_CUTOFF = 3.0
@@ -42,6 +43,7 @@ class RobotMotion:
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
+        shaking: speed at which the contacts of wheels shake that the filter smooths away (T,) [m/s]; its frequency [Hz].
     """
 
     recording: int
@@ -58,6 +60,8 @@ class RobotMotion:
     imu: FloatArray
     pose: FloatArray
     tracked_twist: FloatArray
+    shaking: FloatArray
+    shaking_frequency: float
 
     @property
     def yaw(self) -> FloatArray:
@@ -110,6 +114,9 @@ def read_motions(
             others = slice(4 * n, 4 * n + 6)
             sensed = np.where(np.isfinite(block[:, others]), smooth[:, others], np.nan)
             pose = sensed[:, 3:]
+            shaking = wheel_shaking(
+                robot, block[:, : 2 * n].reshape(-1, n, 2), block[:, 2 * n : 4 * n].reshape(-1, n, 2), wide
+            )
             motions.append(
                 RobotMotion(
                     recording=index,
@@ -126,6 +133,8 @@ def read_motions(
                     imu=sensed[keep, :3],
                     pose=base_pose(robot, pose[keep]),
                     tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),
+                    shaking=shaking.speed[keep].copy(),
+                    shaking_frequency=shaking.frequency,
                 )
             )
     return motions

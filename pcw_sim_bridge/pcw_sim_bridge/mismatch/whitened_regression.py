@@ -17,12 +17,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
+from scipy import linalg, special, stats
 
 from .column_bank import ColumnBank
 from .noise_model import NoiseModel
 from .regression_problem import FloatArray, IntArray, RegressionProblem, Shape
 
+PIECE = 1.0  # of a recording, long enough for the errors of one to say little of the next [s]
 Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 
 
@@ -264,6 +265,36 @@ class WhitenedRegression:
         extended = np.concatenate([-mean, np.ones((len(grams), 1))], axis=1)
         scores: FloatArray = np.einsum("bi,bij,bj->b", extended, grams, extended)
         return scores
+
+    def misfit_covariance(self, fit: Fit) -> FloatArray:
+        """Covariance (k, k) of a fit's numbers by how the blocks disagree about them, whatever the residual is like.
+
+        Where the model is not quite right the residual is no noise, and one block pulls the numbers this way and another that
+        way by more than their own noise would: (A^-1 S A^-1), S the covariance of the sum of the blocks' scores.
+        Source: White, Econometrica 48 (1980); with blocks as clusters, Liang and Zeger, Biometrika 73 (1986).
+        """
+        grams = self.grams(fit.instances)
+        scores = grams[:, :-1, -1] - grams[:, :-1, :-1] @ fit.mean
+        scores -= scores.mean(axis=0)
+        pulled = scores @ fit.covariance
+        covariance: FloatArray = pulled.T @ pulled * (len(grams) / max(len(grams) - 1, 1))
+        return covariance
+
+    def log_odds(self, other: Fit, fit: Fit) -> float:
+        """Log odds of one set against another that has more evidence, no surer than the recording's pieces agree on them.
+
+        Evidence adds up advantages as if one of the two were exact. Where neither is, one describes this piece better and
+        the other that one, and a sum of which the pieces make a large part by chance decides nothing.
+        Source: Vuong, Econometrica 57 (1989): the sum against its own scatter; here by pieces, whose errors are related.
+        """
+        difference = other.log_evidence - fit.log_evidence
+        advantage = self.whitened_residual(fit) ** 2 - self.whitened_residual(other) ** 2
+        time = self._flat // self.problem.residual.shape[1]
+        _, piece = np.unique(time // max(round(PIECE * self.problem.rate), 1), return_inverse=True)
+        pieces = np.bincount(piece, weights=0.5 * advantage)
+        scatter = float(np.std(pieces, ddof=1)) * math.sqrt(len(pieces)) if len(pieces) > 1 else math.inf
+        doubt = float(special.logit(stats.t.cdf(difference / max(scatter, 1e-300), len(pieces) - 1)))
+        return max(difference, doubt)
 
     def tolerance_cost(self, fit: Fit) -> float:
         """Half the squared distance of the description's numbers from nominal, in tolerances [nats]."""

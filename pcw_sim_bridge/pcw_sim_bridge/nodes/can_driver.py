@@ -30,13 +30,14 @@ from pcw_description.nodes.node_tools import (
 
 from ..can.can_file import on_udp, read_can_file
 from ..can.can_robot import ENABLE_TIME, CanRobot, TimedReading
-from ..can.python_can import PythonCanTransport
+from ..can.python_can import PythonCanTransport, free_log_name
 from ..can.supervisor import Fault
 from .joint_command_messages import read_joint_command
 
 READINGS_REMEMBERED = 32  # whose commands may still come
 # A callback that computes keeps the thread of the bus waiting for at most so long; Python's own 5 ms exceed a period [s].
 SWITCH_INTERVAL = 5e-4
+AUTOSTART_WITHIN = 20.0  # that drives are waited for [s]
 SETTLING = 0.2  # in which drives say that they are off [s]
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -61,8 +62,10 @@ class CanDriverNode(RobustLifecycleNode):
             self, "udp_port", 0, "buses as UDP multicast at this port, for drive_emulator; 0: as the file says",
             range=(0, 65535), read_only=True,
         )  # fmt: skip
-        autostart = declare(self, "autostart", False, "configure and activate at once", read_only=True)
-        self._log_path = declare(self, "log", "", "write all frames to this .log, .asc or .blf", read_only=True)
+        autostart = declare(self, "autostart", False, "configure and activate once the drives answer", read_only=True)
+        self._log_path = declare(
+            self, "log", "", "write all frames to this .log, .asc or .blf; a number is added where it exists", read_only=True
+        )
         self.robot, self._file = robot, read_can_file(name, robot)
         if port:
             self._file = on_udp(self._file, port)
@@ -70,7 +73,7 @@ class CanDriverNode(RobustLifecycleNode):
         self._message = JointState(name=list(robot.joint_names))
         self._can: CanRobot | None = None
         self._thread: threading.Thread | None = None
-        self._running = self._active = False
+        self._running = self._active = self._topics = False
         self._told: list[str] = []
         self._reading_times: OrderedDict[int, float] = OrderedDict()
         self._problems = Problems(self)
@@ -79,33 +82,59 @@ class CanDriverNode(RobustLifecycleNode):
         self.create_service(Trigger, "~/clear_faults", self._on_clear_faults)
         self.create_service(Trigger, "~/home", self._on_home)
         self.create_timer(0.01, self._look_after_faults, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if autostart and self.trigger_configure() == SUCCESS:
+        self._autostart_until = time.monotonic() + AUTOSTART_WITHIN
+        self._autostart_timer = self.create_timer(0.5, self._autostart, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        if not autostart:
+            self._autostart_timer.cancel()
+
+    def _autostart(self) -> None:
+        """Configure and activate once; drives that are switched on a little later are waited for."""
+        if self._can is None and self.trigger_configure() == SUCCESS:
             self.trigger_activate()
+        elif self._can is None and time.monotonic() < self._autostart_until:
+            return
+        elif self._can is None:
+            self.get_logger().error(f"autostart: given up after {AUTOSTART_WITHIN:g} s; configure and activate by hand")
+        self._autostart_timer.cancel()
 
     # --- Lifecycle ---------------------------------------------------------------------------------------
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Open the buses and set up every drive."""
+        self._make_topics()
         try:
-            transport = PythonCanTransport(self._file.buses, log=self._log_path or None)
+            log = free_log_name(self._log_path) if self._log_path else None
+            transport = PythonCanTransport(self._file.buses, log=log)
             self._can = CanRobot(self.robot, self._file, transport)
+            # What is there now stays: the collector need not look through it in the middle of a period, which takes tens of
+            # ms. From configure on the drives watch for heartbeats, so that the periods begin at once.
+            gc.collect()
+            gc.freeze()
             self._can.configure()
         except PcwError as error:
             self.get_logger().error(f"not configured: {error}")
             self._close_can()
+            self._remove_topics()
             return FAILURE
+        self._start_cycles()
         for drive in self._can.drives:
             for note in drive.notes:
                 self.get_logger().warning(f"{drive.name}: {note}")
         for load in self._can.loads.values():
             self.get_logger().info(load.arithmetic())
-        # What is there now stays: the collector need not look through it in the middle of a period, which takes tens of ms.
-        gc.collect()
-        gc.freeze()
+        return super().on_configure(state)
+
+    def _make_topics(self) -> None:
+        self._remove_topics()  # of a transition that failed
         self._states = self.create_publisher(JointState, "joint_states", SENSOR_STREAM_SOURCE)
         self._commands = self.create_subscription(JointState, "joint_commands", self._on_command, COMMAND)
-        self._start_cycles()
-        return super().on_configure(state)
+        self._topics = True
+
+    def _remove_topics(self) -> None:
+        if self._topics:
+            self._topics = False
+            self.destroy_subscription(self._commands)
+            self.destroy_publisher(self._states)
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
         """Give the drives torque, all or none."""
@@ -135,23 +164,13 @@ class CanDriverNode(RobustLifecycleNode):
         """Close the buses and remove the topics."""
         self._active = False
         self._close_can()
-        self.destroy_subscription(self._commands)
-        self.destroy_publisher(self._states)
+        self._remove_topics()
         return super().on_cleanup(state)
-
-    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
-        """Let go of the robot for good."""
-        self.close()
-        return super().on_shutdown(state)
-
-    def on_error(self, state: State) -> TransitionCallbackReturn:
-        """Let go of the robot after a failed transition."""
-        self.close()
-        return super().on_error(state)
 
     def close(self) -> None:
         """Zero torque, then none, and close the buses."""
         self._active = False
+        self._autostart_timer.cancel()
         self._close_can()
 
     def _let_go(self) -> None:
@@ -221,10 +240,19 @@ class CanDriverNode(RobustLifecycleNode):
             command = None
             self._problems.add(f"{error}; the torque is zero")
         try:
-            self._can.command(command, self._reading_times.get(stamp_to_ns(message.header.stamp)))
+            self._can.command(command, self._answers(message))
         except Exception as error:
             self.get_logger().error(traceback.format_exc())
             self._can.stop([Fault("exception", "can_driver", f"{type(error).__name__}: {error}")])
+
+    def _answers(self, message: JointState) -> float | None:
+        """Return the time of the reading that a command answers [s]; of another stamp in the past, that time; else None."""
+        stamp_ns = stamp_to_ns(message.header.stamp)
+        known = self._reading_times.get(stamp_ns)
+        if known is not None or stamp_ns == 0:
+            return known
+        age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
+        return time.monotonic() - age if age > self._file.timeouts.command else None
 
     def _look_after_faults(self) -> None:
         """Deactivate after a fault; the torque is off already."""
@@ -236,9 +264,9 @@ class CanDriverNode(RobustLifecycleNode):
             for fault in faults[len(self._told) if faults[: len(self._told)] == self._told else 0 :]:
                 self.get_logger().error(f"stopped: {fault}")
             self._told = faults
-            if self._active and faults:
-                self.trigger_deactivate()
             self._diagnostics.report()
+        if self._active and faults:
+            self.trigger_deactivate()
 
     def _on_clear_faults(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Set up every drive anew; gives no torque."""
@@ -284,6 +312,8 @@ class CanDriverNode(RobustLifecycleNode):
             level, message = ERROR, "stopped until ~/clear_faults: " + "; ".join(map(str, can.faults))
         elif problems:
             level, message = WARN, problems
+        elif log_problem := getattr(can.transport, "log_problem", ""):
+            level, message = WARN, f"{can.state}; {log_problem}"
         elif can.foreign:
             nodes = ", ".join(f"0x{i:03X} on {bus}" for bus, i in list(can.foreign)[:8])
             level, message = WARN, f"{can.state}; frames of nobody in the file: {nodes}"

@@ -1,9 +1,9 @@
-"""The ground under every caster: joint_states and slip/observer (or odom) in, terrain and terrain/map out."""
+"""The ground under every caster: joint_states and slip/observer (or odom) in, terrain, terrain/grip and terrain/map out."""
 
 from __future__ import annotations
 
 import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid, Odometry
@@ -28,22 +28,27 @@ from pcw_description.nodes.node_tools import (
 )
 from pcw_description.robot_description import STEER
 
-from ..believed_slip import independent_slip
 from ..errors import TerrainError
-from ..robot_terrain import RobotReading, RobotTerrain, RobotTerrainEstimate
-from ..terrain_classes import classify
+from ..observed_ground import ObservedGround
+from ..robot_terrain import RobotReading, RobotTerrainEstimate
+from ..shared_friction import shared_friction
+from ..slip_slope import SlipSlopeEstimate
 from ..terrain_map import MapParameters, TerrainMap
+from .caster_status import caster_status
+from .same_stamp import SameStamp
 
 SOURCES = ("observer", "odom")
-# Slip, force and motion older than this against joint_states are not used [s].
+# Motion older than this against joint_states is not used [s].
 OLDEST = 0.05
 
 
 class TerrainNode(Node):
-    """Steps the estimators on every joint_states and publishes at a lower rate.
+    """Steps the estimators and publishes at a lower rate.
 
-    terrain holds the casters whose ground is vouched for, and those that stand on a place of the map that is known. After a
-    gap or a jump back in time the estimators begin anew; the map stays.
+    A step takes joint_states and slip/observer of the same stamp, whichever comes first, so that speeds and slips belong
+    together; with odom, every joint_states. terrain holds the casters whose ground is vouched for, and those that stand on a
+    place of the map that is known; terrain/grip holds all of them, by what forces may be shared. After a gap or a jump back in
+    time the estimators begin anew; the map stays.
     """
 
     def __init__(self) -> None:
@@ -62,10 +67,12 @@ class TerrainNode(Node):
         cells = max(1, min(round(size / resolution), 4000))
         half = 0.5 * cells * resolution
         self._map = TerrainMap(MapParameters(resolution, cells, cells, (-half, -half)))
-        self._terrain, self._B = RobotTerrain(self.robot), joint_matrix_blocks(self.robot)
+        self._ground = ObservedGround(self.robot)
+        self._terrain = self._ground.terrain
+        self._B = joint_matrix_blocks(self.robot)
         self._warm_up()
-        self._state, self._estimate = self._terrain.initial_state(), None
-        self._slip: tuple[int, np.ndarray, np.ndarray] | None = None
+        self._begin_anew()
+        self._longest_gap = longest_gap
         self._odom: tuple[int, np.ndarray, np.ndarray] | None = None
         self._watch, self._unusable, self._problems = StampWatch(longest_gap), 0, Problems(self)
         self._silence = Silence(self._watch)
@@ -76,6 +83,7 @@ class TerrainNode(Node):
         ]
         self._slip_index = {name: i for i, name in enumerate(directions)}
         self._publisher = self.create_publisher(JointState, "terrain", SENSOR_SOURCE)
+        self._grip_publisher = self.create_publisher(JointState, "terrain/grip", SENSOR_SOURCE)
         self._map_publisher = self.create_publisher(OccupancyGrid, "terrain/map", LATCHED)
         self._map_frame = "odom"
         self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR_STREAM)
@@ -84,15 +92,20 @@ class TerrainNode(Node):
             self.create_subscription(JointState, "slip/observer", self._on_slip, SENSOR_STREAM)
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="ground", parts=self._parts)
 
+    def _begin_anew(self) -> None:
+        self._state, self._observed = self._terrain.initial_state(), self._ground.initial_state()
+        self._estimate: RobotTerrainEstimate | None = None
+        self._grip: SlipSlopeEstimate | None = None
+        self._same_stamp, self._stepped_at = SameStamp(), 0
+
     def _warm_up(self) -> None:
         """Have everything compiled before the first measurement."""
-        rest, state = np.zeros((self.robot.n, 2)), self._terrain.initial_state()
-        self._terrain.step(state, RobotReading(rest, rest, rest, np.zeros(self.robot.n)), 1e-3)
+        n = self.robot.n
+        reading = RobotReading(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n))
+        self._ground.step(self._ground.initial_state(), reading, 1e-3)
 
     def _on_slip(self, message: JointState) -> None:
-        _, slip, force = joint_state_arrays(message, self._slip_index, (self.robot.n, 2))
-        known = np.isfinite(slip).all() and np.isfinite(force).all()
-        self._slip = (stamp_to_ns(message.header.stamp), slip, force) if known else None
+        self._take(self._same_stamp.second(stamp_to_ns(message.header.stamp), message))
 
     def _on_odom(self, message: Odometry) -> None:
         position, q, twist = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist
@@ -109,41 +122,63 @@ class TerrainNode(Node):
         if self._watch.repeated:
             return
         if dt is None:
-            self._state, self._estimate = self._terrain.initial_state(), None
-        position, velocity, effort = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
+            self._begin_anew()
+        now = stamp_to_ns(message.header.stamp)
+        if self._source == "observer":
+            self._take(self._same_stamp.first(now, message))
+        elif self._odom is not None and abs(now - self._odom[0]) * 1e-9 <= OLDEST:
+            self._take((message, None))
+
+    def _take(self, pair: tuple[JointState, JointState | None] | None) -> None:
+        """Step with joint_states and, where that is the source, slip/observer of the same stamp; publish what is due."""
+        if pair is None:
+            return
+        joints, slip = pair
+        now = stamp_to_ns(joints.header.stamp)
+        # Where nothing was vouched for in between, no time has passed for what the estimators remember.
+        dt = min((now - self._stepped_at) * 1e-9, self._longest_gap) if self._stepped_at else 1e-3
         try:
-            if not self._step(stamp_to_ns(message.header.stamp), position, velocity, effort, dt or 1e-3):
+            position, velocity, effort = joint_state_arrays(joints, self._joint_index, (self.robot.n, 2))
+            self._check(position, velocity)
+            if slip is None:
+                self._by_odom(position, velocity, effort, dt)
+            elif not self._by_observer(position, velocity, slip, dt):
                 return
         except PcwError as error:
             self._watch.take_back()
             self._unusable += 1
             self._problems.add(str(error))
             return
-        if dt is not None and self._due.due(dt):
-            self._publish(message)
-        if dt is not None and self._map_due.due(dt) and self._map.known:
-            self._publish_map(message)
-
-    def _step(self, now: int, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float) -> bool:
-        """Step the estimators; returns whether there was something to step them with."""
-        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-            missing = [
-                name for name, i in self._joint_index.items() if not np.isfinite(position.ravel()[i] + velocity.ravel()[i])
-            ]
-            raise TerrainError(f"joint_states lacks {', '.join(missing)}; allowed: all joints, finite position and velocity")
-        newest = self._slip if self._source == "observer" else self._odom
-        if newest is None or abs(now - newest[0]) * 1e-9 > OLDEST:
-            return False
-        if self._source == "observer":
-            sensed = np.einsum("nij,nj->ni", self._B, velocity)
-            reading = RobotReading(sensed, newest[1], newest[2], np.ascontiguousarray(position[:, STEER]))
-            loads = self._terrain.normal_force(reading.steer_angle, reading.force)
-            known = independent_slip(self.robot, sensed, newest[1], newest[2], loads)
-            reading = RobotReading(sensed, newest[1], newest[2], reading.steer_angle, known)
-            self._state, self._estimate = self._terrain.step(self._state, reading, dt)
-        else:
-            self._state, self._estimate = self._terrain.step_with_twist(self._state, position, velocity, effort, newest[2], dt)
+        first, self._stepped_at = not self._stepped_at, now
         self._pin(now)
+        if not first and self._due.due(dt):
+            self._publish(joints)
+        if not first and self._map_due.due(dt) and self._map.known:
+            self._publish_map(joints)
+
+    def _check(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Raise a TerrainError for joints that are missing or not finite."""
+        missing = [n for n, i in self._joint_index.items() if not np.isfinite(position.ravel()[i] + velocity.ravel()[i])]
+        if missing:
+            raise TerrainError(f"joint_states lacks {', '.join(missing)}; allowed: all joints, finite position and velocity")
+
+    def _by_odom(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float) -> None:
+        assert self._odom is not None
+        self._state, self._estimate = self._terrain.step_with_twist(
+            self._state, position, velocity, effort, self._odom[2], dt
+        )
+
+    def _by_observer(self, position: np.ndarray, velocity: np.ndarray, message: JointState, dt: float) -> bool:
+        """Step with what the observer says; returns whether it vouches for the forces at least."""
+        _, slip, force = joint_state_arrays(message, self._slip_index, (self.robot.n, 2))
+        if not np.isfinite(force).all():
+            return False
+        slip_known = bool(np.isfinite(slip).all())
+        slip = slip if slip_known else np.zeros_like(slip)
+        sensed, steer_angle = np.einsum("nij,nj->ni", self._B, velocity), np.ascontiguousarray(position[:, STEER])
+        reading = RobotReading(sensed, slip, force, steer_angle, np.full(self.robot.n, slip_known))
+        self._observed, found = self._ground.step(self._observed, reading, dt)
+        self._estimate, self._grip = found.ground, found.slopes
         return True
 
     def _places(self, now: int) -> np.ndarray | None:
@@ -180,8 +215,14 @@ class TerrainNode(Node):
         refused = fill_joint_state(message, position=rows[:, 0], velocity=rows[:, 1], effort=rows[:, 2])
         if refused:
             self._problems.add(f"terrain: {', '.join(refused)} not finite, left empty")
-            self._state = self._terrain.initial_state()
+            self._begin_anew()
+            return
         self._publisher.publish(message)
+        told = shared_friction(self.robot, self._estimate, self._grip)
+        grip = JointState(name=list(self.robot.caster_names))
+        grip.header.stamp = measured.header.stamp
+        fill_joint_state(grip, position=told.lambda_p, effort=told.mu_p)
+        self._grip_publisher.publish(grip)
 
     def _publish_map(self, measured: JointState) -> None:
         p, message = self._map.parameters, OccupancyGrid()
@@ -192,27 +233,8 @@ class TerrainNode(Node):
         message.data = array.array("b", self._map.occupancy().tobytes())
         self._map_publisher.publish(message)
 
-    def _parts(self) -> Mapping[str, Status]:
-        estimate, parts = self._estimate, {}
-        if estimate is None:
-            return {}
-        for i, name in enumerate(self.robot.caster_names):
-            values = {
-                "slip": float(estimate.slip[i]),
-                "friction": float(estimate.friction[i]),
-                "changes": int(estimate.changes[i]),
-            }
-            if not estimate.valid[i]:
-                wrong = "wrong sign" in estimate.reason[i] or "does not fit" in estimate.reason[i]
-                parts[name] = Status(WARN if wrong else OK, estimate.reason[i], values)
-                continue
-            spread = np.sqrt(np.diag(estimate.covariance[i]))
-            values |= {"mu_p": float(estimate.mu_p[i]), "mu_p_spread": float(spread[0])}
-            values |= {"lambda_p": float(estimate.lambda_p[i]), "lambda_p_spread": float(spread[1])}
-            classes = classify(values["mu_p"], values["lambda_p"], estimate.covariance[i])
-            values |= {f"class {c.name}": c.probability for c in classes[:3]}
-            parts[name] = Status(OK, f"{classes[0].name} ({classes[0].probability:.0%})", values)
-        return parts
+    def _parts(self) -> dict[str, Status]:
+        return {} if self._estimate is None else caster_status(self.robot.caster_names, self._estimate, self._grip)
 
     def _status(self) -> Status:
         values: dict[str, object] = {"gaps": self._watch.gaps, "repeated_stamps": self._watch.repeats}
@@ -230,8 +252,8 @@ class TerrainNode(Node):
         if self._silence.since_last_report():
             return Status(WARN, "no joint_states since the last report", values)
         if estimate is None:
-            topic = "slip/observer" if self._source == "observer" else "odom"
-            return Status(WARN, f"no {topic} near joint_states in time", values)
+            waits = "slip/observer with the stamps of" if self._source == "observer" else "odom near"
+            return Status(WARN, f"no {waits} joint_states", values)
         return Status(OK, f"ground known under {int(estimate.valid.sum())} of {self.robot.n} casters", values)
 
 

@@ -54,7 +54,7 @@ def make(
         if not drafts.exists():
             _check_new(folder)
         seal(sealed_file, header, _prepared(orders, header, drafts, progress, workers), folder)
-        drafts.unlink()
+        drafts.unlink(missing_ok=True)
     sealed = open_sealed(sealed_file, folder)
     if any(sealed[key] != value for key, value in header.items()):
         begun = {key: sealed[key] for key in header}

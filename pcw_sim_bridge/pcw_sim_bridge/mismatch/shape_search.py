@@ -1,0 +1,143 @@
+"""Parameters that shape an effect's columns (an order, a phase, a place): where the evidence is largest, and intervals.
+
+    found = refined_shape(regression, others, instance)
+    low, high = shape_interval(regression, others, found, "phase")
+
+Each parameter is searched on the scale of its grid, linear or logarithmic, one after the other: first between the
+neighbours on the grid, since there may be two maxima, then by parabolas through the best point and those beside it. An
+interval is that of the profile likelihood: all else is fitted again at each value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .whitened_regression import Fit, Instance, WhitenedRegression
+
+# Drop of the log likelihood at the ends of a 95 % interval.
+DROP = 1.92
+# Widest interval of a parameter on a logarithmic scale, as a ratio to either side.
+WIDEST_RATIO = 30.0
+COARSE = 7  # points between the neighbours on the grid
+SWEEPS = 3  # over all parameters, as long as one gains
+WORTH = 0.1  # nats; a further point that promises less is not asked for
+PARABOLAS = 6
+
+
+def refined_shape(
+    regression: WhitenedRegression, others: Sequence[Instance], instance: Instance, coarse: bool = True
+) -> Instance:
+    """Return the instance with the shape near its own that explains most beside others; coarse: as far as its neighbours."""
+    resolution = regression.problem.terms[instance.term].resolution
+    for sweep in range(SWEEPS):
+        before = regression.fit([*others, instance]).log_evidence
+        for name, (kind, spacing) in resolution.items():
+            place = _Place(regression, others, instance, name, kind, bounded=True)
+            instance = place.moved(_largest(place.evidence, place.width(spacing), coarse and sweep == 0))
+        if len(resolution) < 2 or regression.fit([*others, instance]).log_evidence < before + WORTH:
+            break
+    return instance
+
+
+def shape_interval(
+    regression: WhitenedRegression, others: Sequence[Instance], instance: Instance, name: str, widening: float = 1.0
+) -> tuple[float, float]:
+    """Return the 95 % interval of a shaping parameter; of one that was not searched, its value twice.
+
+    Args:
+        widening: so many times the variance that the noise model says.
+    """
+    centre = dict(instance.shape)[name]
+    kind, spacing = regression.problem.terms[instance.term].resolution.get(name, ("", 0.0))
+    if not kind or (kind == "log" and centre <= 0.0):
+        return centre, centre
+    place = _Place(regression, others, instance, name, kind)
+    widest = math.log(WIDEST_RATIO) if kind == "log" else 2.0 * spacing
+    best, drop = place.evidence(0.0), DROP * widening
+
+    def end(direction: float) -> float:
+        inner, outer = 0.0, 1e-4 * (1.0 if kind == "log" else spacing)
+        while outer < widest and best - place.evidence(direction * outer) < drop:
+            inner, outer = outer, outer * 3.0
+        for _ in range(5):
+            middle = math.sqrt(inner * outer) if inner > 0.0 else 0.5 * outer
+            if best - place.evidence(direction * middle) < drop:
+                inner = middle
+            else:
+                outer = middle
+        return place.value(direction * min(outer, widest))
+
+    return end(-1.0), end(1.0)
+
+
+class _Place:
+    """One shaping parameter of an instance, on the scale that it is searched on; steps count from where it is."""
+
+    def __init__(
+        self,
+        regression: WhitenedRegression,
+        others: Sequence[Instance],
+        instance: Instance,
+        name: str,
+        kind: str,
+        bounded: bool = False,
+    ) -> None:
+        self._regression, self._others, self._instance = regression, others, instance
+        self._name, self._kind = name, kind
+        self._known: dict[float, float] = {}
+        # A size that cannot be is no better an explanation for its larger evidence, unless no other is known.
+        self._bounded = bounded and self._is_allowed(regression.fit([*others, instance]))
+
+    def _is_allowed(self, fit: Fit) -> bool:
+        return self._regression.each_within_bounds(fit)[-1]
+
+    def width(self, spacing: float) -> float:
+        """Distance of a neighbour on the grid."""
+        return math.log(spacing) if self._kind == "log" else spacing
+
+    def value(self, step: float) -> float:
+        """Value of the parameter at a step."""
+        centre = float(dict(self._instance.shape)[self._name])
+        return centre * math.exp(step) if self._kind == "log" else centre + step
+
+    def moved(self, step: float) -> Instance:
+        """The instance at a step."""
+        if step == 0.0:
+            return self._instance
+        return self._regression.with_shape(self._instance, {**dict(self._instance.shape), self._name: self.value(step)})
+
+    def evidence(self, step: float) -> float:
+        """Log evidence there; none where the size would have to be one that cannot be."""
+        if step not in self._known:
+            fit = self._regression.fit([*self._others, self.moved(step)])
+            self._known[step] = -math.inf if self._bounded and not self._is_allowed(fit) else fit.log_evidence
+        return self._known[step]
+
+
+def _largest(evidence: Callable[[float], float], width: float, coarse: bool) -> float:
+    """Step of largest evidence within a width to either side, or near the last one where the search is not coarse."""
+    steps = np.linspace(-1.0, 1.0, COARSE) * width
+    spacing = float(steps[1] - steps[0])
+    best = max((float(s) for s in np.round(steps / spacing) * spacing), key=evidence) if coarse else 0.0
+    spacing *= 1.0 if coarse else 0.5
+    for _ in range(PARABOLAS):
+        left, middle, right = evidence(best - spacing), evidence(best), evidence(best + spacing)
+        if max(left, right) > middle:
+            best += spacing if right > left else -spacing
+            continue
+        bend = left - 2.0 * middle + right
+        if not math.isfinite(bend):
+            spacing *= 0.3
+            continue
+        offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+        if -0.5 * bend * offset**2 >= WORTH:
+            vertex = best + offset * spacing
+            if evidence(vertex) > middle:
+                best = vertex
+        elif -0.5 * bend < WORTH:
+            break
+        spacing *= 0.3
+    return best

@@ -1,0 +1,62 @@
+"""Wheels that shake faster than the channels' filter lets pass: a drive's loop that is too stiff for its tyres does that.
+
+Such a wheel slips to and fro, and what its tyre carries on average has little to do with its average slip: filtered, the
+recording looks quiet and follows no model. The noise of an encoder looks the same in its angles, and a noisy measurement of
+torque in the torques; what shakes a wheel is in both. So the speed is taken that the angles show, or that the torques give
+the rotors and wheels by themselves, whichever is less.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import signal
+
+from pcw_description.robot_description import DRIVE, STEER, RobotDescription
+
+from .regression_problem import FloatArray
+from .signal_filter import SignalFilter
+
+SPECTRUM_SAMPLES = 512
+
+
+@dataclasses.dataclass(frozen=True)
+class Shaking:
+    """How wheels shake.
+
+    Attributes:
+        speed: amplitude of the contact that shakes most (T,) [m/s].
+        frequency: of the joint that shakes most [Hz]; 0 where none does.
+    """
+
+    speed: FloatArray
+    frequency: float
+
+
+def wheel_shaking(robot: RobotDescription, position: FloatArray, torque: FloatArray, low_pass: SignalFilter) -> Shaking:
+    """Return how wheels shake.
+
+    Args:
+        robot: its radii, offsets and inertias.
+        position, torque: of the joints as measured, on a regular grid (T, n, 2) [rad, N m]. NaN torques: nothing is said.
+        low_pass: what is faster than it lets pass is looked at, amplitudes over its period.
+    """
+    rate, count = low_pass.rate, len(position)
+    if not np.isfinite(torque).all() or low_pass.cutoff >= 0.45 * rate:
+        return Shaking(np.zeros(count), 0.0)
+    inertia = np.array([[c.rotors.drive + c.wheel.inertia_axle, c.rotors.steer + c.module.inertia_zz] for c in robot.casters])
+    reach = np.stack([robot.wheel_radius, np.linalg.norm(robot.caster_offset, axis=1)], axis=1)
+
+    def fast(values: FloatArray) -> FloatArray:
+        return values - low_pass.smooth(values)
+
+    # From sample to sample: a central difference sees nothing of what changes its sign with every sample.
+    by_angle = fast(np.diff(position, axis=0, prepend=position[:1]) * rate)
+    by_torque = fast(np.cumsum(fast(torque), axis=0) / (rate * np.maximum(inertia, 1e-9)))
+    squares = [np.maximum(low_pass.smooth(values**2), 0.0) for values in (by_angle, by_torque)]
+    contact = reach * np.sqrt(2.0 * np.minimum(*squares))
+    speed = np.hypot(contact[:, :, DRIVE], contact[:, :, STEER]).max(axis=1)
+    worst = int(np.argmax(np.mean(contact**2, axis=0)))
+    frequencies, density = signal.welch(by_angle.reshape(count, -1)[:, worst], rate, nperseg=min(SPECTRUM_SAMPLES, count))
+    return Shaking(speed, float(frequencies[int(np.argmax(density))]))

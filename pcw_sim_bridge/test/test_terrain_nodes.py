@@ -1,0 +1,121 @@
+"""The terrain node with the real slip observer and a plant, as processes over real DDS: from torques to the ground."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from pcw_description import load_robot  # noqa: E402
+from pcw_description.nodes.node_testing import RosTest  # noqa: E402
+from pcw_description.nodes.node_tools import stamp_to_ns  # noqa: E402
+from pcw_description.robot_file import save_robot  # noqa: E402
+from pcw_sim_bridge.split_friction import slippery  # noqa: E402
+
+THESIS = load_robot("thesis")
+NAMES = list(THESIS.joint_names)
+MU, CRITICAL = 0.2, 0.1  # under the first wheel; all nodes believe in the robot file's 0.8 and 0.1
+SPEED, PERIOD = 0.6, 1.0 / 500.0
+
+
+class SlippingDriver:
+    """Answers every joint_states: drives along, and lets the first wheel slip to and fro beyond its peak where told to.
+
+    It stands until observer and terrain are there, and answers a reading when the observer has: so the plant, in lock-step
+    with the answers, runs no faster than the nodes on a computer that has other work.
+    """
+
+    def __init__(self, ros, slips=True):
+        self.slips, self.count, self.reading, self.observed, self.ready = slips, 0, None, None, False
+        self.publisher = ros.peer.create_publisher(JointState, "joint_commands", 10)
+        ros.peer.create_subscription(JointState, "joint_states", self._read, 1000)
+        ros.peer.create_subscription(JointState, "slip/observer", self._hear, 1000)
+        ros.peer.create_subscription(JointState, "terrain/grip", self._terrain_is_there, 1)
+        ros.peer.create_timer(0.5, self._answer_anyway)
+
+    def _terrain_is_there(self, _):
+        self.ready = True
+
+    def _read(self, state):
+        self.reading = state
+        if not self.ready:
+            self._answer(state, np.zeros((4, 2)))
+        elif self.observed == state.header.stamp:
+            self._drive(state)
+
+    def _hear(self, slip):
+        self.observed = slip.header.stamp
+        if self.ready and self.reading is not None and self.observed == self.reading.header.stamp:
+            self._drive(self.reading)
+
+    def _answer_anyway(self):
+        """Go on although the observer does not speak of the last reading: a lost one must not end the test."""
+        if self.ready and self.reading is not None:
+            self._drive(self.reading)
+
+    def _drive(self, state):
+        self.count += 1
+        t = self.count * PERIOD
+        rolls = SPEED * min(t / 2.0, 1.0)
+        wanted = np.full(4, rolls)
+        if self.slips and t > 2.5:
+            wanted[0] = rolls * (1.0 + 0.2 * (1.0 - math.cos(5.0 * (t - 2.5))))
+        position, velocity = np.reshape(state.position, (4, 2)), np.reshape(state.velocity, (4, 2))
+        effort = np.zeros((4, 2))
+        effort[:, 0] = np.clip(np.array([6.0, 3.0, 3.0, 3.0]) * (wanted / 0.075 - velocity[:, 0]), -10.0, 10.0)
+        effort[:, 1] = np.clip(-40.0 * position[:, 1] - 2.0 * velocity[:, 1], -8.0, 8.0)
+        self._answer(state, effort)
+
+    def _answer(self, state, effort):
+        self.reading = None
+        message = JointState(name=NAMES, effort=effort.ravel().tolist())
+        message.header.stamp = state.header.stamp
+        self.publisher.publish(message)
+
+
+@pytest.fixture
+def nodes(tmp_path):
+    """Bridge with ice under one wheel, in lock-step with the driver; observer and terrain as they are started."""
+    save_robot(dataclasses.replace(THESIS, physics=(slippery(THESIS, ("front_left",), MU),)), tmp_path / "real.yaml")
+    with RosTest() as ros:
+        ros.start("pcw_estimation.nodes.slip_observer", "-p", "publish_rate:=500.0")
+        ros.start("pcw_terrain.nodes.terrain")
+        ros.start(
+            "pcw_sim_bridge.nodes.bridge", "-p", f"robot:={tmp_path / 'real.yaml'}", "-p", "lockstep:=true",
+            "-p", "real_time_factor:=1.0", "-p", "lockstep_timeout:=60.0",
+        )  # fmt: skip
+        yield ros
+
+
+def finite(messages):
+    return all(np.isfinite([*m.position, *m.velocity, *m.effort]).all() for m in messages)
+
+
+def test_a_wheel_that_slips_tells_its_ground_and_the_others_say_nothing(nodes):
+    """The wheel's own slip is known from the others, which grip; theirs is what the file says, and is not vouched for."""
+    terrain, grip = nodes.listen(JointState, "terrain"), nodes.listen(JointState, "terrain/grip")
+    slip = nodes.listen(JointState, "slip/observer")
+    driver = SlippingDriver(nodes)
+    nodes.wait_for(lambda: terrain and "front_left" in terrain[-1].name and driver.count > 3500)
+    known = [m for m in terrain if list(m.name) == ["front_left"]]
+    assert len(known) > 10 and all(set(m.name) <= {"front_left"} for m in terrain)
+    assert known[-1].effort[0] == pytest.approx(MU, rel=0.06)
+    assert known[-1].position[0] == pytest.approx(CRITICAL, rel=0.15)
+    assert grip[-1].effort[0] < 0.5 * min(grip[-1].effort[1:])
+    assert finite(terrain) and finite(grip) and all(list(m.name) == list(THESIS.caster_names) for m in grip)
+    # Every terrain comes from a reading and the slip of the same time.
+    assert {stamp_to_ns(m.header.stamp) for m in terrain} <= {stamp_to_ns(m.header.stamp) for m in slip}
+
+
+@pytest.mark.nightly  # three processes more
+def test_a_robot_that_only_rolls_learns_nothing_of_its_ground(nodes):
+    terrain, diagnostics = nodes.listen(JointState, "terrain"), nodes.listen(DiagnosticArray, "/diagnostics")
+    driver = SlippingDriver(nodes, slips=False)
+    nodes.wait_for(lambda: driver.count > 2000 and len(terrain) > 50)
+    assert all(len(m.name) == 0 for m in terrain)
+    assert any("ground known under 0 of 4 casters" in s.message for d in diagnostics for s in d.status)

@@ -1,0 +1,54 @@
+"""Wheels that shake: told from noise of angles and of torques, with the speed at the ground."""
+
+import numpy as np
+import pytest
+
+from pcw_description import load_robot
+from pcw_sim_bridge.mismatch.signal_filter import SignalFilter
+from pcw_sim_bridge.mismatch.wheel_shaking import wheel_shaking
+
+ROBOT = load_robot("thesis")
+RATE, SAMPLES = 500.0, 4000
+DRIVE_INERTIA = ROBOT.casters[0].rotors.drive + ROBOT.casters[0].wheel.inertia_axle
+LOW_PASS = SignalFilter(RATE, 15.0)
+
+
+def rolling() -> tuple[np.ndarray, np.ndarray]:
+    """A slow motion and the torques of it (T, n, 2)."""
+    time = np.arange(SAMPLES) / RATE
+    angle = np.sin(2.0 * np.pi * 0.5 * time)[:, None, None] * np.ones((1, ROBOT.n, 2))
+    return 3.0 * angle, 0.5 * angle
+
+
+@pytest.mark.parametrize("frequency", [40.0, 110.0, 249.0])
+def test_a_wheel_that_shakes_is_found_up_to_half_the_rate(frequency):
+    """A torque that swings about an inertia alone: its amplitude over inertia and frequency, at the radius."""
+    position, torque = rolling()
+    swing = 0.05
+    phase = 2.0 * np.pi * frequency * np.arange(SAMPLES) / RATE + 0.3
+    torque[:, 2, 0] += DRIVE_INERTIA * swing * (2.0 * np.pi * frequency) * np.cos(phase)
+    position[:, 2, 0] += swing / (2.0 * np.pi * frequency) * -np.cos(phase)
+    found = wheel_shaking(ROBOT, position, torque, LOW_PASS)
+    # From sample to sample a sine of the frequency f moves by 2 sin(pi f / rate) of its amplitude.
+    seen = 2.0 * np.sin(np.pi * frequency / RATE) * swing / (2.0 * np.pi * frequency) * RATE
+    by_torque = np.pi * frequency / RATE / np.sin(np.pi * frequency / RATE) * swing
+    middle = found.speed[SAMPLES // 4 : -SAMPLES // 4]
+    assert np.median(middle) == pytest.approx(ROBOT.wheel_radius[2] * min(seen, by_torque), rel=0.1)
+    assert found.frequency == pytest.approx(frequency, abs=1.0)
+
+
+def test_noise_of_one_sensor_is_no_shaking():
+    """Coarse encoders alone, and noisy torques alone, each large enough to pass for 0.1 m/s."""
+    position, torque = rolling()
+    rng = np.random.default_rng(0)
+    coarse = position + rng.uniform(-4e-3, 4e-3, position.shape)
+    noisy = torque + 20.0 * DRIVE_INERTIA * rng.standard_normal(torque.shape)
+    for one, other in ((coarse, torque), (position, noisy)):
+        assert np.quantile(wheel_shaking(ROBOT, one, other, LOW_PASS).speed, 0.99) < 0.005
+
+
+def test_nothing_is_said_without_torques():
+    position, torque = rolling()
+    found = wheel_shaking(ROBOT, position, np.full_like(torque, np.nan), LOW_PASS)
+    assert not found.speed.any()
+    assert found.frequency == 0.0
