@@ -20,6 +20,7 @@ from pcw_sim_bridge.mismatch.regression_problem import (
     Term,
 )
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
+from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
 SAMPLES, RATE = 600, 50.0
@@ -143,6 +144,64 @@ def test_the_interval_of_a_shape_holds_it_where_the_problem_is_exact():
     # Cramer-Rao for a sine of amplitude 4 in noise of 0.3.
     expected = 2.0 * 1.96 * 30.0 * NOISE / (4.0 * np.sqrt(SAMPLES / 2.0))
     assert np.median(widths) == pytest.approx(expected, rel=0.2)
+
+
+def turned_problem(angle: float, tolerance: float) -> RegressionProblem:
+    """An angle that is off by so much, a number of the description with a tolerance, and an effect that turns it further."""
+    time = np.arange(SAMPLES) / RATE
+    rng = np.random.default_rng(5)
+
+    def model(turned: float) -> np.ndarray:
+        return (np.cos(2.1 * time + turned) - np.cos(2.1 * time))[:, None]
+
+    measured = model(angle) + 0.1 * NOISE * rng.standard_normal((SAMPLES, 1))
+
+    def exact(changes, sizes):
+        return measured - model(changes.get("zero", 0.0) + sum(float(s.coefficients[0]) for s in sizes)), ["zero"]
+
+    def derive(changes, sizes):
+        there = changes.get("zero", 0.0) + sum(float(s.coefficients[0]) for s in sizes)
+        return {"zero": (model(there + 1e-6) - model(there)) / 1e-6}
+
+    slope = -np.sin(2.1 * time)
+    return one_channel(
+        10.0 * np.sin(time), measured[:, 0], nuisances=(Nuisance("zero", "rad", 0.0, tolerance, slope[:, None]),),
+        terms=(
+            Term(
+                "offset", ("axis",), (LinearParameter("offset", "rad", -2.0, 2.0, 3.0),), ({},),
+                lambda shape: slope[:, None, None], is_exact=True, is_curved=True,
+            ),
+        ),
+        exact=exact, derive=derive,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("angle", "named"), [(0.15, False), (0.4, False), (1.2, True)])
+def test_what_a_tolerance_holds_is_no_effect_however_curved(angle, named):
+    """At an effect's size its secant and the slope of the same number differ, which precise sensors see."""
+    search = EffectSearch(turned_problem(angle, 0.2), np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.conclude(search.made_exact((Instance(0, (), (0,)),)), 5.0)
+    assert selection.losses[0] > 50.0
+    found = search.retuned_away(selection)
+    assert bool(found.fit.instances) == named
+    assert channel_deviations(search.residual_of(found.fit.instances), search.problem.valid) == pytest.approx(
+        [0.1 * NOISE], rel=0.1
+    )
+
+
+def test_a_shape_that_is_tried_has_the_evidence_of_its_fit():
+    """Trials and fits say the same, of shapes on the grid and beside it, alone and beside another."""
+    problem = shaped_problem(0)
+    search = EffectSearch(problem, np.random.default_rng(0))
+    regression = search.whiten_at(problem.residual)
+    for others in ((), (Instance(0, (("phase", 2.3),), (0,)),)):
+        trials = ShapeTrials(regression, others, Instance(0, (("phase", 0.5),), (0,)))
+        for phase in (0.5, 0.7, 1.0, 3.5):
+            instance = Instance(0, (("phase", phase),), (0,), occam=1.5)
+            evidence, allowed = trials.evidence(instance)
+            fit = regression.fit([*others, instance])
+            assert evidence == pytest.approx(fit.log_evidence, abs=1e-6)
+            assert allowed == regression.each_within_bounds(fit)[-1]
 
 
 def test_what_is_at_the_description_stays_there_without_a_model():

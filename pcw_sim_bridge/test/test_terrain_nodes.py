@@ -107,7 +107,7 @@ def test_a_wheel_that_slips_tells_its_ground_and_the_others_say_nothing(nodes):
     assert known[-1].position[0] == pytest.approx(CRITICAL, rel=0.15)
     assert grip[-1].effort[0] < 0.5 * min(grip[-1].effort[1:])
     assert finite(terrain) and finite(grip) and all(list(m.name) == list(THESIS.caster_names) for m in grip)
-    # Readings and slips are paired in the order of time. (Whether the slip of a stamp reached this test too is up to discovery.)
+    # Readings and slips are paired in the order of time; whether this test hears every slip is up to discovery.
     stamps = [stamp_to_ns(m.header.stamp) for m in terrain]
     assert stamps == sorted(set(stamps))
 

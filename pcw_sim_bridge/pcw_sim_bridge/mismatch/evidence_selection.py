@@ -123,7 +123,7 @@ class EffectSearch:
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
         threshold = self.calibrate(regression, instances)
-        return self.settle_on(self.prune(regression, instances, threshold), threshold)
+        return self.retuned_away(self.settle_on(self.prune(regression, instances, threshold), threshold))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
         """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
@@ -143,6 +143,34 @@ class EffectSearch:
             selection = self.prune(regression, chosen, threshold)
             if _terms(selection.fit.instances) == _terms(chosen):
                 break
+        return selection
+
+    def retuned_away(self, selection: Selection) -> Selection:
+        """Drop effects that other numbers of the description stand in for as soon as the problem is exact at those.
+
+        Where it is exact with an effect at work, columns of the same cause differ by their curvature: with precise sensors
+        that is evidence enough for an effect that is well within a tolerance.
+        """
+        instances = selection.fit.instances
+        for index, instance in enumerate(instances):
+            regression = selection.regression
+            others = instances[:index] + instances[index + 1 :]
+            fit = regression.retuned_instead(selection.fit, index)
+            if fit is None:
+                continue
+            here = self.problem, self._point
+            for _ in range(EXACT_ROUNDS):
+                if not self._exact_at(fit):
+                    break
+                self.problem = self.problem.derived()
+                regression = regression.moved(self.problem)
+                fit = regression.fit(others)
+            loss = selection.fit.log_evidence - fit.log_evidence
+            if loss < selection.threshold:
+                self._note_drop(self.label(instance), loss, "re-tuning does the same")
+                regression = self.whiten_at(self.residual_of(others))
+                return self.retuned_away(self.prune(regression, others, selection.threshold))
+            self.problem, self._point = here
         return selection
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:

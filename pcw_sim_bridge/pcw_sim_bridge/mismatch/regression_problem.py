@@ -288,9 +288,15 @@ class RegressionProblem:
     def columns(self, term: int, shape: tuple[tuple[str, float], ...]) -> FloatArray:
         """Columns (T, C, P) of one term at one shape, computed once."""
         if (term, shape) not in self._remembered:
-            found = self.terms[term].columns(dict(shape))
-            self._remembered[term, shape] = self.near[term].column(found) if term in self.near else found
+            self._remembered[term, shape] = self.tried_columns(term, shape)
         return self._remembered[term, shape]
+
+    def tried_columns(self, term: int, shape: tuple[tuple[str, float], ...]) -> FloatArray:
+        """The same, not remembered: of a shape that a search only tries."""
+        if (term, shape) in self._remembered:
+            return self._remembered[term, shape]
+        found = self.terms[term].columns(dict(shape))
+        return self.near[term].column(found) if term in self.near else found
 
     def around(self, term: int, shape: tuple[tuple[str, float], ...]) -> RegressionProblem:
         """Return the problem with columns of a term that may be compared with its secant at the shape where it is exact.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -31,13 +31,13 @@ from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 from .all_cores import on_all_cores
 from .axis_channels import kernel_arguments
 from .channel_differences import ChannelDifferences
+from .composed_columns import Columns, Placed, Turning, frozen
 from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
 HALF_A_TURN = math.pi  # [rad]
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
-TURNING_ERROR = 0.01  # of columns at one direction that are put together from those at two others
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
     DescriptionEffect: ("acceleration",), ChassisForceEffect: ("speed", "v_x", "v_y"),
@@ -199,7 +199,7 @@ class _TermMaker:
             log_prior=effect.log_prior,
             target=target,
             shapes=shapes,
-            columns=remembered if turning is None else _Turning(remembered, turning),
+            columns=self._put_together(remembered, chosen, turning),
             arguments=VARIABLES_OF.get(type(effect), ()),
             parameters=tuple(
                 _linear(p, neutral[p.name], room) for p, room in zip(shown, self._room(everything[:, :, seen]), strict=True)
@@ -268,6 +268,16 @@ class _TermMaker:
         values = {p.name: 0.0 for p in effect.searched_parameters} | {**at, **neutral, name: value}
         return self.differences.of_effect(EffectInstance(effect.name, target, values, axis)) / step
 
+    def _put_together(
+        self, columns: Columns, chosen: ChosenShapes, turning: str | None
+    ) -> Columns:
+        """Columns of all shapes from those of a few, where a direction or a place on the robot shapes them."""
+        if turning is not None:
+            return Turning(columns, turning)
+        if {"x", "y"} == set(chosen.resolution):
+            return Placed(columns, np.max(np.abs(self.robot.steer_axis), axis=0))
+        return columns
+
     def _has_rotors(self, target: Sequence[str], axis: str) -> bool:
         """Whether there are motors that a gear could let turn on their own."""
         casters = [self.robot.casters[self.robot.caster_index(name)] for name in target]
@@ -322,54 +332,15 @@ class _TermMaker:
 
 
 def _once_more(
-    shape: Shape, found: FloatArray, columns: Callable[[Shape], FloatArray]
-) -> Callable[[Shape], FloatArray]:
+    shape: Shape, found: FloatArray, columns: Columns
+) -> Columns:
     """Return `columns` with what was found at one shape kept until it is asked for; then the problem remembers it."""
-    known = {_frozen(shape): found}
+    known = {frozen(shape): found}
 
     def kept(shape: Shape) -> FloatArray:
-        return known.pop(_frozen(shape)) if _frozen(shape) in known else columns(shape)
+        return known.pop(frozen(shape)) if frozen(shape) in known else columns(shape)
 
     return kept
-
-
-class _Turning:
-    """Columns of an effect that a direction or a phase shapes, of which two a quarter turn apart make all others.
-
-    That an effect is of this kind is seen by trying one direction in between; one that is not is evaluated at each.
-    """
-
-    def __init__(self, columns: Callable[[Shape], FloatArray], name: str) -> None:
-        self._columns, self._name = columns, name
-        self._turns: bool | None = None
-        self._quarters: dict[tuple[tuple[str, float], ...], tuple[FloatArray, FloatArray]] = {}
-
-    def __call__(self, shape: Shape) -> FloatArray:
-        """Columns (T, C, P) at one shape."""
-        rest = {name: value for name, value in shape.items() if name != self._name}
-        if self._turns is None:
-            self._turns = self._is_of_two(rest)
-        if not self._turns:
-            return self._columns(shape)
-        first, last = self._quarters_of(rest)
-        return math.cos(shape[self._name]) * first + math.sin(shape[self._name]) * last
-
-    def _is_of_two(self, rest: Shape) -> bool:
-        first, last = self._quarters_of(rest)
-        between = self._columns({**rest, self._name: math.pi / 4.0})
-        error = float(np.linalg.norm(math.sqrt(0.5) * (first + last) - between))
-        return error <= TURNING_ERROR * float(np.linalg.norm(between))
-
-    def _quarters_of(self, rest: Shape) -> tuple[FloatArray, FloatArray]:
-        key = _frozen(rest)
-        if key not in self._quarters:
-            first, last = (self._columns({**rest, self._name: angle}) for angle in (0.0, math.pi / 2.0))
-            self._quarters[key] = first, last
-        return self._quarters[key]
-
-
-def _frozen(shape: Shape) -> tuple[tuple[str, float], ...]:
-    return tuple(sorted(shape.items()))
 
 
 def _is_direction(parameter: EffectParameter) -> bool:

@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .whitened_regression import Fit, Instance, WhitenedRegression
+from .shape_trials import ShapeTrials
+from .whitened_regression import Instance, WhitenedRegression
 
 # Drop of the log likelihood at the ends of a 95 % interval.
 DROP = 1.92
@@ -32,12 +33,15 @@ def refined_shape(
 ) -> Instance:
     """Return the instance with the shape near its own that explains most beside others; coarse: as far as its neighbours."""
     resolution = regression.problem.terms[instance.term].resolution
+    if not resolution:
+        return instance
+    trials = ShapeTrials(regression, others, instance)
     for sweep in range(SWEEPS):
-        before = regression.fit([*others, instance]).log_evidence
+        before = trials.evidence(instance)[0]
         for name, (kind, spacing) in resolution.items():
-            place = _Place(regression, others, instance, name, kind, bounded=True)
+            place = _Place(trials, instance, name, kind, bounded=True)
             instance = place.moved(_largest(place.evidence, place.width(spacing), coarse and sweep == 0))
-        if len(resolution) < 2 or regression.fit([*others, instance]).log_evidence < before + WORTH:
+        if len(resolution) < 2 or trials.evidence(instance)[0] < before + WORTH:
             break
     return instance
 
@@ -54,7 +58,7 @@ def shape_interval(
     kind, spacing = regression.problem.terms[instance.term].resolution.get(name, ("", 0.0))
     if not kind or (kind == "log" and centre <= 0.0):
         return centre, centre
-    place = _Place(regression, others, instance, name, kind)
+    place = _Place(ShapeTrials(regression, others, instance), instance, name, kind)
     widest = math.log(WIDEST_RATIO) if kind == "log" else 2.0 * spacing
     best, drop = place.evidence(0.0), DROP * widening
 
@@ -76,23 +80,12 @@ def shape_interval(
 class _Place:
     """One shaping parameter of an instance, on the scale that it is searched on; steps count from where it is."""
 
-    def __init__(
-        self,
-        regression: WhitenedRegression,
-        others: Sequence[Instance],
-        instance: Instance,
-        name: str,
-        kind: str,
-        bounded: bool = False,
-    ) -> None:
-        self._regression, self._others, self._instance = regression, others, instance
+    def __init__(self, trials: ShapeTrials, instance: Instance, name: str, kind: str, bounded: bool = False) -> None:
+        self._trials, self._instance = trials, instance
         self._name, self._kind = name, kind
         self._known: dict[float, float] = {}
         # A size that cannot be is no better an explanation for its larger evidence, unless no other is known.
-        self._bounded = bounded and self._is_allowed(regression.fit([*others, instance]))
-
-    def _is_allowed(self, fit: Fit) -> bool:
-        return self._regression.each_within_bounds(fit)[-1]
+        self._bounded = bounded and trials.evidence(instance)[1]
 
     def width(self, spacing: float) -> float:
         """Distance of a neighbour on the grid."""
@@ -107,13 +100,13 @@ class _Place:
         """The instance at a step."""
         if step == 0.0:
             return self._instance
-        return self._regression.with_shape(self._instance, {**dict(self._instance.shape), self._name: self.value(step)})
+        return self._trials.regression.with_shape(self._instance, {**dict(self._instance.shape), self._name: self.value(step)})
 
     def evidence(self, step: float) -> float:
         """Log evidence there; none where the size would have to be one that cannot be."""
         if step not in self._known:
-            fit = self._regression.fit([*self._others, self.moved(step)])
-            self._known[step] = -math.inf if self._bounded and not self._is_allowed(fit) else fit.log_evidence
+            evidence, allowed = self._trials.evidence(self.moved(step))
+            self._known[step] = -math.inf if self._bounded and not allowed else evidence
         return self._known[step]
 
 

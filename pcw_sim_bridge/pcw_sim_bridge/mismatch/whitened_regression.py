@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +25,9 @@ from .noise_model import NoiseModel
 from .regression_problem import FloatArray, IntArray, RegressionProblem, Shape
 
 PIECE = 1.0  # of a recording, long enough for the errors of one to say little of the next [s]
+# Re-tuning that leaves less than this part of what an effect does may be all there is to it, the rest being curvature.
+RETUNED_SHARE = 0.05
+TRIED_BYTES = 2**26  # of columns of shapes that were only tried
 Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 
 
@@ -92,7 +96,31 @@ class _ScanGroup:
     log_prior: FloatArray
 
 
-def _marginal_gains(
+def marginal_gains(
+    gram: FloatArray, cross: FloatArray, moment: FloatArray, projected: FloatArray, deviations: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gain in log evidence (K, N) of K candidates of P parameters each, for N targets, and their parameters (K, P, N).
+
+    Args:
+        gram: of each candidate's own columns (K, P, P).
+        cross: L^-1 X^T of all candidates' columns (k, K P), with L L^T the precision of the set.
+        moment: candidates' columns times targets (K P, N).
+        projected: L^-1 X^T of the targets (k, N).
+        deviations: of the parameters (K or 1, P).
+    """
+    count, width = gram.shape[0], gram.shape[1]
+    moment = (moment - cross.T @ projected).reshape(count, width, -1)
+    cross = cross.reshape(-1, count, width)
+    schur = gram - np.einsum("ksp,ksq->spq", cross, cross, optimize=True)
+    schur = schur + np.eye(width) / deviations[:, :, None] ** 2
+    mean: FloatArray = np.linalg.solve(schur, moment)
+    explained = np.einsum("spn,spn->sn", moment, mean)
+    log_determinant = np.linalg.slogdet(schur)[1] + 2.0 * np.sum(np.log(deviations), axis=1)
+    gain: FloatArray = 0.5 * explained - 0.5 * log_determinant[:, None]
+    return gain, mean
+
+
+def _gains_within(
     gram: FloatArray,
     cross: FloatArray,
     moment: FloatArray,
@@ -101,24 +129,8 @@ def _marginal_gains(
     lower: FloatArray,
     upper: FloatArray,
 ) -> FloatArray:
-    """Gain in log evidence (K, N) of K candidates of P parameters each, for N targets; -inf beyond the bounds.
-
-    Args:
-        gram: of each candidate's own columns (K, P, P).
-        cross: L^-1 X^T of all candidates' columns (k, K P), with L L^T the precision of the set.
-        moment: candidates' columns times targets (K P, N).
-        projected: L^-1 X^T of the targets (k, N).
-        deviations, lower, upper: of the parameters (K or 1, P).
-    """
-    count, width = gram.shape[0], gram.shape[1]
-    moment = (moment - cross.T @ projected).reshape(count, width, -1)
-    cross = cross.reshape(-1, count, width)
-    schur = gram - np.einsum("ksp,ksq->spq", cross, cross, optimize=True)
-    schur = schur + np.eye(width) / deviations[:, :, None] ** 2
-    mean = np.linalg.solve(schur, moment)
-    explained = np.einsum("spn,spn->sn", moment, mean)
-    log_determinant = np.linalg.slogdet(schur)[1] + 2.0 * np.sum(np.log(deviations), axis=1)
-    gain = 0.5 * explained - 0.5 * log_determinant[:, None]
+    """The same, -inf where a parameter is beyond its bounds (K or 1, P)."""
+    gain, mean = marginal_gains(gram, cross, moment, projected, deviations)
     allowed = np.all((mean >= lower[:, :, None]) & (mean <= upper[:, :, None]), axis=1)
     result: FloatArray = np.where(allowed, gain, -np.inf)
     return result
@@ -163,6 +175,7 @@ class WhitenedRegression:
         self._places: dict[tuple[int, Frozen], slice] = {}
         self._long_scans: dict[int, tuple[npt.NDArray[np.float32], FloatArray]] = {}
         self._short_scans: list[_ScanGroup] | None = None
+        self._tried: OrderedDict[tuple[int, Frozen], FloatArray] = OrderedDict()
 
     def _rows(self, values: FloatArray) -> FloatArray:
         """Whiten (T, C) or (T, C, K), keep usable rows, apply root weights -> (R,) or (R, K)."""
@@ -184,6 +197,7 @@ class WhitenedRegression:
             self.nuisance[piece] *= factor
         self._bank.rescale(factors)
         self._long_scans.clear()
+        self._tried.clear()
         self._short_scans = None
 
     def block_labels(self) -> list[int]:
@@ -218,6 +232,18 @@ class WhitenedRegression:
         """Whitened exact columns of an instance's active parameters (R, active)."""
         return self._bank.columns(self._indices(instance))
 
+    def tried_columns(self, instance: Instance) -> FloatArray:
+        """The same of a shape that is only tried; the last ones are remembered."""
+        key = instance.term, instance.shape
+        if key in self._places:
+            return self.columns(instance)
+        if key not in self._tried:
+            self._tried[key] = self._rows(self.problem.tried_columns(*key))
+            while sum(columns.nbytes for columns in self._tried.values()) > TRIED_BYTES and len(self._tried) > 1:
+                self._tried.popitem(last=False)
+        self._tried.move_to_end(key)
+        return self._tried[key][:, list(instance.active)]
+
     def deviations(self, instances: Sequence[Instance]) -> FloatArray:
         """Prior deviations of nuisances and active parameters (k,)."""
         parts = [self.problem.nuisance_deviations()]
@@ -236,11 +262,14 @@ class WhitenedRegression:
         picked = self._picked(instances)
         return self._bank.by_block(picked)
 
+    def gram(self, instances: Sequence[Instance]) -> FloatArray:
+        """Gram matrix of [nuisances, instances..., target], (k + 1, k + 1)."""
+        return self._bank.gram(self._picked(instances))
+
     def fit(self, instances: Sequence[Instance]) -> Fit:
         """Joint fit of nuisances and instances."""
-        picked = self._picked(instances)
         deviations = self.deviations(instances)
-        mean, inverse, log_determinant, rss = _solve(self._bank.gram(picked), deviations)
+        mean, inverse, log_determinant, rss = _solve(self.gram(instances), deviations)
         occam = sum(instance.occam for instance in instances)
         prior = sum(self.problem.terms[instance.term].log_prior for instance in instances)
         log_evidence = -0.5 * log_determinant - 0.5 * rss - occam + prior
@@ -295,6 +324,27 @@ class WhitenedRegression:
         scatter = float(np.std(pieces, ddof=1)) * math.sqrt(len(pieces)) if len(pieces) > 1 else math.inf
         doubt = float(special.logit(stats.t.cdf(difference / max(scatter, 1e-300), len(pieces) - 1)))
         return max(difference, doubt)
+
+    def retuned_instead(self, fit: Fit, index: int) -> Fit | None:
+        """The fit without one of its instances, whose work is done by re-tuning; None where that would leave much of it.
+
+        Of all the ways to do nearly the same the one that the tolerances like best: closer ones follow the curvature of the
+        instance's columns, and may be far away.
+        """
+        instance, count = fit.instances[index], self.nuisance.shape[1]
+        start = count + sum(len(other.active) for other in fit.instances[:index])
+        own = slice(start, start + len(instance.active))
+        work = self.columns(instance) @ fit.mean[own]
+        deviations = self.problem.nuisance_deviations()
+        scaled = self.nuisance * (deviations / max(RETUNED_SHARE * float(np.linalg.norm(work)), 1e-300))
+        target = work / max(RETUNED_SHARE * float(np.linalg.norm(work)), 1e-300)
+        steps = np.linalg.solve(scaled.T @ scaled + np.eye(count), scaled.T @ target)
+        if float(np.linalg.norm(target - scaled @ steps)) > 1.0:
+            return None
+        others = fit.instances[:index] + fit.instances[index + 1 :]
+        mean = np.delete(fit.mean, own)
+        mean[:count] += steps * deviations
+        return dataclasses.replace(self.fit(others), mean=mean)
 
     def tolerance_cost(self, fit: Fit) -> float:
         """Half the squared distance of the description's numbers from nominal, in tolerances [nats]."""
@@ -397,7 +447,7 @@ class WhitenedRegression:
             products = bank.products(with_target, flat)
             cross = linalg.solve_triangular(factor, products[:-1], lower=True)
             moment = products[-1:].T if targets is None else bank.columns(flat).T @ targets
-            gains = _marginal_gains(
+            gains = _gains_within(
                 group.gram[keep], cross, moment, projected,
                 group.deviations[keep], group.lower[keep], group.upper[keep],
             ) + group.log_prior[keep][:, None]  # fmt: skip
@@ -416,7 +466,7 @@ class WhitenedRegression:
             moment = (flat_columns.T @ right.astype(np.float32)).astype(float)
             parameters = [term.parameters[i] for i in term.base_indices()]
             bounds = [np.array([[getattr(p, name) for p in parameters]]) for name in ("deviation", "lower", "upper")]
-            gains = _marginal_gains(gram, cross, moment, projected, *bounds) + term.log_prior
+            gains = _gains_within(gram, cross, moment, projected, *bounds) + term.log_prior
             self._collect([(index, tuple(sorted(shape.items()))) for shape in term.shapes], gains, results)
         if targets is None:
             results[0].sort(key=lambda candidate: -candidate.gain)

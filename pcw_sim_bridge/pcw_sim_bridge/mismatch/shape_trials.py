@@ -1,0 +1,41 @@
+"""The evidence of one effect beside a set, for one shape after another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import linalg
+
+from .whitened_regression import Instance, WhitenedRegression, marginal_gains
+
+
+class ShapeTrials:
+    """A set whose fit is known, beside which an instance is tried with many shapes.
+
+    Only what a shape adds is computed, and nothing of it is kept in the regression: a search tries hundreds of shapes, of
+    which one is chosen.
+    """
+
+    def __init__(self, regression: WhitenedRegression, others: Sequence[Instance], instance: Instance) -> None:
+        """Take the set that stays, and what is tried beside it."""
+        self.regression = regression
+        gram, deviations = regression.gram(others), regression.deviations(others)
+        self._factor = np.linalg.cholesky(gram[:-1, :-1] + np.diag(1.0 / deviations**2))
+        self._projected = linalg.solve_triangular(self._factor, gram[:-1, -1:], lower=True)
+        self._design = regression.design(others)
+        term = regression.problem.terms[instance.term]
+        parameters = [term.parameters[k] for k in instance.active]
+        self._deviations = np.array([[p.deviation for p in parameters]])
+        self._lower, self._upper = np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
+        self._without = regression.fit(others).log_evidence + term.log_prior
+
+    def evidence(self, instance: Instance) -> tuple[float, bool]:
+        """Log evidence of the set with an instance of that term, and whether its parameters are within their bounds."""
+        columns = self.regression.tried_columns(instance)
+        cross = linalg.solve_triangular(self._factor, self._design.T @ columns, lower=True)
+        moment = columns.T @ self.regression.target[:, None]
+        gains, means = marginal_gains((columns.T @ columns)[None], cross, moment, self._projected, self._deviations)
+        mean = means[0, :, 0]
+        allowed = bool(np.all((mean >= self._lower) & (mean <= self._upper)))
+        return self._without + float(gains[0, 0]) - instance.occam, allowed
