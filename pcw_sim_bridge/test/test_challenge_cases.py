@@ -178,7 +178,7 @@ def test_parameters_are_allowed_at_every_magnitude(name: str, scene: Scene) -> N
 def test_size_is_in_proportion_and_nothing_is_no_size(channels: HealthyChannels) -> None:
     assert channels.size([simulate(world().quiet(), RUN, ())]).size == 0.0
     sizes = []
-    for coulomb in (0.3, 0.9):
+    for coulomb in (0.02, 0.06):  # larger ones are counted as outliers are
         effect = effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": coulomb})
         sizes.append(channels.size([simulate(world().quiet(), RUN, [effect])]))
     assert sizes[1].size == pytest.approx(3.0 * sizes[0].size, rel=0.15)
@@ -196,6 +196,23 @@ def test_what_is_within_tolerance_has_hardly_any_evidence(channels: HealthyChann
         found.append(channels.size([simulate(world().quiet(), RUN, [effect])]))
     assert found[0].evidence < 5.0
     assert found[1].evidence > 18.0
+
+
+def test_what_moves_the_robot_otherwise_has_no_more_evidence_than_its_tolerances_cost() -> None:
+    """All steering zeros 2.85 deviations off drive another way: what differs on the way is no evidence of anything."""
+    robot = load_robot("tidybot2")
+    run = dataclasses.replace(RUN, excitation="random_goals", duration=20.0)
+    there = World(robot, with_deviations(robot, draw_deviations(robot, np.random.default_rng(3))), "reduced", "computed_torque")
+    quiet = there.quiet()
+    own = HealthyChannels(robot, [simulate(there, run, ())], [simulate(quiet, run, ())])
+    found = []
+    for deviations in (2.85, 20.0):
+        offset = deviations * robot.tolerance("steer_zero").value
+        effect = effect_instance("steer_zero_offset", robot.caster_names, {"offset": offset})
+        found.append(own.size([simulate(quiet, run, [effect])]))
+    assert found[0].size > 3.0
+    assert found[0].evidence < 0.5 * robot.n * 2.85**2 + 10.0
+    assert found[1].evidence > 100.0
 
 
 def test_a_wheel_comes_onto_its_patch(scene: Scene, healthy: SimulatedRecording) -> None:

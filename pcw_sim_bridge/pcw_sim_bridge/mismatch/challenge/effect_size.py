@@ -3,9 +3,13 @@
     size = max over channels of rms(residual with - residual without) / noise floor
 
 The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. An effect may be large
-and yet be no more than re-tuning within tolerances explains; `evidence` says what that explanation would cost [nats]:
+and yet be no more than re-tuning within tolerances explains; `evidence` says what the run costs more with the effect than
+without it [nats], each re-tuned by itself:
 
-    1/2 min over nu of ( |change - N nu|^2 / floor^2 + |nu / tolerance|^2 ).
+    cost = min over nu of ( sum rho((residual - N nu) / floor) + 1/2 |nu / tolerance|^2 ),
+
+exact where the re-tuning comes out. rho is Huber's loss, since where wheels slip hard a little other motion leaves much else.
+Each run has its own columns: what two runs differ by is no change of one motion, as soon as the effect moves the robot.
 """
 
 from __future__ import annotations
@@ -19,11 +23,13 @@ import numpy as np
 from pcw_description.robot_description import STEER, RobotDescription
 
 from ..errors import MismatchError
+from ..noise_model import huber_weights
 from ..regression_problem import BoolArray, FloatArray, RegressionProblem
 from ..robot_channels import RobotProblemBuilder
 from .simulated_case import SimulatedRecording
 
-EXACT_ROUNDS = 3  # of re-tuning, each exact where the one before came out
+EXACT_ROUNDS = 4  # of re-tuning, each exact where the one before came out
+REWEIGHTED = 6  # times, for Huber's loss
 # Two runs whose casters are further apart than this are two motions [rad].
 TURNED_OTHERWISE = 2.0
 # A part of the samples in which an effect does nothing is no part of its region.
@@ -69,6 +75,7 @@ class HealthyChannels:
         self._deviations = self.problem.nuisance_deviations()
         self.floor = self._noise_floor()
         self._quiet = _build(nominal, quiet, self._cutoff)
+        self._healthy_cost = self._cost(self._quiet)
         self._headings = [_headings(recording) for recording in quiet]
 
     def size(self, recordings: Sequence[SimulatedRecording]) -> EffectSize:
@@ -89,24 +96,15 @@ class HealthyChannels:
         rows = problem.valid & np.isfinite(change)
         relative = _rms(change, rows) / self.floor
         largest = int(np.argmax(relative))
-        evidence, moved = math.inf, np.zeros(len(self._deviations))
-        for _ in range(EXACT_ROUNDS):
-            # To first order alone a zero that is off would be more than a zero that is off.
-            changes = {n.name: float(value) for n, value in zip(problem.nuisances, moved, strict=True)}
-            exact = self._change(with_effect.exact_at(changes, ()))
-            rest, wanted = self._retuned(exact, rows, self.floor)
-            left = np.where(rows, rest / self.floor, 0.0)
-            found = 0.5 * float(np.sum(left**2) + np.sum((wanted / self._deviations) ** 2))
-            if found >= evidence:
-                break
-            evidence, moved = found, wanted
+        cost, moved = self._cost(with_effect)
+        healthy_cost, healthy_moved = self._healthy_cost
         active = np.any(rows & (np.abs(change) > self.floor), axis=1)
         return EffectSize(
             size=float(relative[largest]),
             channel=problem.channels[largest].name,
-            evidence=evidence,
+            evidence=max(cost - healthy_cost, 0.0),
             region=_regions(problem, active),
-            retuned={n.name: float(value) for n, value in zip(problem.nuisances, moved, strict=True)},
+            retuned={n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)},
         )
 
     def _change(self, other: RegressionProblem) -> FloatArray:
@@ -115,6 +113,28 @@ class HealthyChannels:
         change = np.zeros_like(self.problem.residual)
         change[:length] = other.residual[:length] - self._quiet.residual[:length]
         return change
+
+    def _cost(self, problem: RegressionProblem) -> tuple[float, FloatArray]:
+        """Least cost of a run, see above, and the re-tuning (K,) that has it."""
+        best, moved = math.inf, np.zeros(len(self._deviations))
+        there = problem
+        for _ in range(EXACT_ROUNDS):
+            columns = np.where(problem.valid[:, :, None], there.nuisance_columns() / self.floor[:, None], 0.0)
+            scaled = columns.reshape(-1, len(self._deviations)) * self._deviations
+            target = np.where(problem.valid, there.residual / self.floor, 0.0).ravel()
+            weights = left = np.ones_like(target)
+            solution = np.zeros(len(self._deviations))
+            for _ in range(REWEIGHTED):
+                weighted = scaled * weights[:, None]
+                solution = np.linalg.solve(weighted.T @ scaled + np.eye(scaled.shape[1]), weighted.T @ target)
+                left = target - scaled @ solution
+                weights = huber_weights(left)
+            cost = float(np.sum(weights * left**2 * (1.0 - 0.5 * weights)) + 0.5 * np.sum(solution**2))
+            if cost >= best:
+                break
+            best, moved = cost, self._deviations * solution
+            there = problem.exact_at({n.name: float(v) for n, v in zip(problem.nuisances, moved, strict=True)}, ())
+        return best, moved
 
     def _noise_floor(self) -> FloatArray:
         residual, valid = self.problem.residual, self.problem.valid
