@@ -202,7 +202,8 @@ def test_what_moves_the_robot_otherwise_has_no_more_evidence_than_its_tolerances
     """All steering zeros 2.85 deviations off drive another way: what differs on the way is no evidence of anything."""
     robot = load_robot("tidybot2")
     run = dataclasses.replace(RUN, excitation="random_goals", duration=20.0)
-    there = World(robot, with_deviations(robot, draw_deviations(robot, np.random.default_rng(3))), "reduced", "computed_torque")
+    true = with_deviations(robot, draw_deviations(robot, np.random.default_rng(3)))
+    there = World(robot, true, "reduced", "computed_torque")
     quiet = there.quiet()
     own = HealthyChannels(robot, [simulate(there, run, ())], [simulate(quiet, run, ())])
     found = []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, Selection
 from pcw_sim_bridge.mismatch.explanation import named_terms
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.regression_problem import (
@@ -313,6 +313,24 @@ def test_odds_are_no_surer_than_the_pieces_of_a_recording_agree():
     assert undecided >= 34  # |t| beyond 2.0 happens once in 20
     odds, evidence = odds_of_second(first + NOISE * rng.standard_normal(3000), first, second)
     assert odds < -10.0 and evidence < -10.0
+
+
+@pytest.mark.parametrize(("alike", "believed"), [(False, True), (True, False)])
+def test_only_what_explains_the_same_is_a_rival(alike, believed):
+    """A term that would explain more, and something else, says nothing against a small one; one that is like it does."""
+    time = np.arange(3000) / RATE
+    small, large = np.sin(time), np.sin(2.9 * time)
+    left = 0.02 * small + 0.01 * np.random.default_rng(6).standard_normal(len(time))
+    rival = small + 0.05 * large if alike else large
+    problem = linear_problem(left + (0.0 if alike else 0.4) * rival, {"small": (small, 100.0), "rival": (rival, 100.0)})
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    # Under the noise that both leave: the larger is not chosen, for whatever reason.
+    regression = search.whiten_at(search.residual_of((Instance(0, (), (0,)), Instance(1, (), (0,)))))
+    instances = (Instance(0, (), (0,)),)
+    selection = Selection(regression, regression.fit(instances), 9.0, (50.0,), (50.0,), ())
+    named = named_terms(search, selection)[0]
+    assert (named.probability > 0.99) == believed
+    assert (named.ambiguous_with == ()) == believed
 
 
 def test_a_number_that_cannot_be_explains_nothing():

@@ -29,7 +29,9 @@ class EffectParameter:
         linear: the contribution is proportional to this parameter (all linear parameters together are additive).
         near_linear: it is so near zero, where the effect vanishes with it; its derivative there tells how the effect shows.
         squared: its square is so.
-        reciprocal: its inverse is so: the effect vanishes as the parameter grows.
+        reciprocal: the inverse of its distance from its pole is so; with a pole at zero, its inverse: the effect vanishes as
+            the parameter grows.
+        pole: of a reciprocal one: -1 for the relative error of what a denominator holds.
         neutral: where the effect vanishes, if not at zero or without bound: a number, or where in the description it
             stands, as "contact.relaxation_length".
         clause: what the effect's sentence goes on with where the number is not its default; `{name}` stands for it.
@@ -46,6 +48,7 @@ class EffectParameter:
     near_linear: bool = False
     squared: bool = False
     reciprocal: bool = False
+    pole: float = 0.0
     neutral: str | float = ""
     clause: str = ""
 

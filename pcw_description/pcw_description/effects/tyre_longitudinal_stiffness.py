@@ -23,9 +23,14 @@ EFFECT = DescriptionEffect(
     axis="drive",
     summary="The tyre is stiffer or softer along than described; its peak friction is the same, at another slip.",
     sentence="The tyre of {target} is stiffer along by {error:+.3g} of the described stiffness.",
-    parameters=(EffectParameter("error", "1", "relative error of the stiffness", -0.9, 10.0, 0.3, near_linear=True),),
+    # What a tyre slips is in proportion to the inverse of its stiffness.
+    parameters=(
+        EffectParameter(
+            "error", "1", "relative error of the stiffness", -0.9, 10.0, 0.3, reciprocal=True, pole=-1.0, neutral=0.0
+        ),
+    ),
     sensors=("joint_states", "imu/data", "ground_truth/odom"),
-    look_alikes=("tyre_relaxation", "wheel_radius_error"),
+    look_alikes=("tyre_lateral_stiffness", "tyre_relaxation", "wheel_radius_error"),
     separating_experiment="accelerate and brake hard at several speeds",
     apply=with_other_stiffness,
 )

@@ -443,7 +443,7 @@ def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
 
 
 def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tuple[float, tuple[str, ...]]:
-    """Probability of an instance among the sets without it or with another term instead, and its look-alikes."""
+    """Probability of an instance among the sets without it, with another term instead or besides, and its look-alikes."""
     problem, regression, fit = search.problem, selection.regression, selection.fit
     own = fit.instances[index]
     others = fit.instances[:index] + fit.instances[index + 1 :]
@@ -466,13 +466,17 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
         ):
             continue
         # With the shape that suits it best, as the named one has: those of its grid would lose however alike the two are.
-        trial = regression.fit([*others, refined_shape(regression, others, candidate.instance)])
+        rival = refined_shape(regression, others, candidate.instance)
+        trial = regression.fit([*others, rival])
         if not regression.within_bounds(trial):
             continue
         mine, theirs = problem.terms[own.term], problem.terms[candidate.instance.term]
-        difference = trial.log_evidence - fit.log_evidence
+        # Two that both have something of their own to explain are no rivals, however much more one of them explains.
+        both = regression.fit([*fit.instances, rival])
+        ours = both if both.log_evidence > fit.log_evidence and regression.within_bounds(both) else fit
+        difference = trial.log_evidence - ours.log_evidence
         if not (mine.once or theirs.once):  # what happens once is in one piece of the recording
-            difference = regression.log_odds(trial, fit)
+            difference = regression.log_odds(trial, ours)
         rivals.append(difference)
         if difference > -AMBIGUOUS:
             alike.append(theirs.effect if theirs.effect != mine.effect else theirs.key)

@@ -76,7 +76,8 @@ class LinearParameter:
         lower, upper, deviation: bounds and prior deviation of the coefficient.
         refinement: zero unless there is evidence for it; not part of the effect when it is first named.
         origin: value of the parameter where the coefficient is zero.
-        reciprocal: the coefficient is the inverse of the parameter, less that of the origin; squared: it is its square.
+        reciprocal: the coefficient is the inverse of the parameter's distance from `pole`, less that of the origin's;
+            squared: it is its square.
         hidden: it is no number of the effect, only of how much of it there is.
     """
 
@@ -88,13 +89,14 @@ class LinearParameter:
     refinement: bool = False
     origin: float = 0.0
     reciprocal: bool = False
+    pole: float = 0.0
     squared: bool = False
     hidden: bool = False
 
     def value(self, coefficient: float) -> float:
         """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""
         if self.reciprocal:
-            return 1.0 / max(coefficient + 1.0 / self.origin, 1e-12)
+            return self.pole + 1.0 / max(coefficient + 1.0 / (self.origin - self.pole), 1e-12)
         if self.squared:
             return math.sqrt(max(coefficient, 0.0))
         return self.origin + coefficient
@@ -103,7 +105,9 @@ class LinearParameter:
         """Return the coefficient of a value."""
         if self.squared:
             return value**2
-        return 1.0 / value - 1.0 / self.origin if self.reciprocal else value - self.origin
+        if self.reciprocal:
+            return 1.0 / (value - self.pole) - 1.0 / (self.origin - self.pole)
+        return value - self.origin
 
     def interval(self, low: float, high: float) -> tuple[float, float]:
         """Return the parameter's interval for one of the coefficient."""

@@ -372,13 +372,18 @@ def _only(effect: Effect, parameter: EffectParameter) -> dict[str, float]:
 def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:
     """Step of the linear coefficient that a difference is taken over, and the parameter's value there."""
     if parameter.reciprocal:
-        step = 0.1 / parameter.typical
-        return step, 1.0 / (step + 1.0 / neutral)
+        step, distance = 0.1 * _typical_inverse(parameter), neutral - parameter.pole
+        return step, parameter.pole + 1.0 / (step + 1.0 / distance)
     if parameter.squared:
         value = SQUARED_STEP * parameter.typical
         return value**2, value
     step = 0.1 * parameter.typical
     return step, neutral + step
+
+
+def _typical_inverse(parameter: EffectParameter) -> float:
+    """Typical coefficient of a reciprocal parameter: of a relative error, about as large as that."""
+    return parameter.typical if parameter.pole else 1.0 / parameter.typical
 
 
 def _linear(parameter: EffectParameter, neutral: float, room: float) -> LinearParameter:
@@ -387,9 +392,11 @@ def _linear(parameter: EffectParameter, neutral: float, room: float) -> LinearPa
     It may be three times what is typical of large robots, and it may do all that there is to be done.
     """
     if parameter.reciprocal:
+        lower, upper = (1.0 / (end - parameter.pole) for end in (parameter.upper, parameter.lower))
+        there = 1.0 / (neutral - parameter.pole)
         return LinearParameter(
-            parameter.name, parameter.unit, 1.0 / parameter.upper - 1.0 / neutral, 1.0 / parameter.lower - 1.0 / neutral,
-            max(3.0 / parameter.typical, room), origin=neutral, reciprocal=True,
+            parameter.name, parameter.unit, lower - there, upper - there, max(3.0 * _typical_inverse(parameter), room),
+            origin=neutral, reciprocal=True, pole=parameter.pole,
         )
     if parameter.squared:
         deviation = max(3.0 * parameter.typical**2, room)

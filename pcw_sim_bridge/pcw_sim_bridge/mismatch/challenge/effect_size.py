@@ -122,8 +122,7 @@ class HealthyChannels:
             columns = np.where(problem.valid[:, :, None], there.nuisance_columns() / self.floor[:, None], 0.0)
             scaled = columns.reshape(-1, len(self._deviations)) * self._deviations
             target = np.where(problem.valid, there.residual / self.floor, 0.0).ravel()
-            weights = left = np.ones_like(target)
-            solution = np.zeros(len(self._deviations))
+            weights: FloatArray = np.ones_like(target)
             for _ in range(REWEIGHTED):
                 weighted = scaled * weights[:, None]
                 solution = np.linalg.solve(weighted.T @ scaled + np.eye(scaled.shape[1]), weighted.T @ target)
