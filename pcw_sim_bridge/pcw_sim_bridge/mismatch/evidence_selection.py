@@ -47,7 +47,7 @@ RESHAPINGS = 3  # the first under the noise that a wrong shape leaves, which mak
 GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
 SPLIT_AMONG = 12  # candidates that a term may have taken in
 GATHERED_AMONG = 2  # candidates that several terms may be parts of
-DERIVED_FROM = 2  # after so many rounds that did not settle, columns are taken anew; after twice as many the next time
+DERIVED_AFTER = 2  # rounds that did not settle; then columns are taken anew
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
@@ -108,11 +108,17 @@ class EffectSearch:
 
     def run(self) -> Selection:
         """Grow, calibrate, prune, settle."""
-        for _ in range(EXACT_ROUNDS):
+        plain = self.problem
+        for count in range(EXACT_ROUNDS):
+            if count == DERIVED_AFTER:
+                self.problem = self.problem.derived()
             regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
             self._settle(regression, ())
             if not self._exact_at(regression.fit(())):
                 break
+        if self.problem.point is not None and self.problem.point.derived:
+            # Exact there, but with the columns of the description: those of effects are so, too, and are compared with them.
+            self.problem = plain.exact_at(self.problem.point.changes, ())
         instances = self.over_complete()
         regression = self.whiten_at(self.residual_of(instances))
         for _ in range(3):
@@ -180,8 +186,9 @@ class EffectSearch:
         """
         reshapings = 0
         for count in range(EXACT_ROUNDS):
-            known = self.problem.point is not None and self.problem.point.derived
-            if count == (2 * DERIVED_FROM if known else DERIVED_FROM):
+            point = self.problem.point
+            # With the slopes of another place one arrives where those are level, and not where the error is least.
+            if point is not None and (not point.derived or count == 1 + DERIVED_AFTER):
                 self.problem = self.problem.derived()
             residual, cost = self._left_and_cost(instances)
             fit = self.whiten_at(residual).fit(instances)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from pcw_description.effects.drive_coulomb_friction import SMOOTHING_SPEED
 from pcw_description.errors import PcwError
 from pcw_description.recording import Recording
-from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDescription
+from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER, RobotDescription
 
 from ..plants.true_robot import as_it_really_is
 from .all_cores import on_all_cores
@@ -44,6 +44,7 @@ from .sudden_slip import sudden_slip
 SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
+TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
 SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slips to and fro is less than at its average slip
@@ -210,13 +211,13 @@ class RobotProblemBuilder:
         return float(np.hypot(shared, MODEL_DEVIATION)) if self.layout.balanced else 0.0
 
     def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
-        """What the model misjudges in each sample (T, C): slips, by a part of the slips there are."""
-        slips = differences.predicted[:, self.layout.consistency]
-        if not slips.size:
-            return np.zeros_like(differences.predicted)
-        size = np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
+        """What the model misjudges in each sample (T, C): slips, by a part of the slips there are, and what an IMU leans."""
         found = np.zeros_like(differences.predicted)
-        found[:, self.layout.consistency] = SLIP_DEVIATION * size
+        slips = differences.predicted[:, self.layout.consistency]
+        if slips.size:
+            found[:, self.layout.consistency] = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
+        if self.layout.imu:
+            found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
         return found
 
     def _valid(self, differences: ChannelDifferences) -> BoolArray:

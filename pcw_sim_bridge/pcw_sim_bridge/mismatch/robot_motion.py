@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import signal
 
 from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
@@ -26,6 +28,9 @@ MOTION_OVERSAMPLING = 4.0
 # The channels end at this part of the resonance of the robot on its tyres.
 TYRE_MARGIN = 0.5
 ALLOWED_DERIVATIVE_NOISE = 0.05
+# Torques tell something where they hold so many times the power that they have in a band where there is noise only [Hz].
+TORQUE_OVER_NOISE, TORQUE_NOISE_BAND = 3.0, (12.0, 40.0)
+PIECE, LEAST_PIECES = 2.0, 4  # [s]; of a spectrum
 LARGEST_GAP, LARGEST_GAP_PERIODS = 0.05, 3.0  # [s], or so many periods of slow joint_states
 LARGEST_TRACKER_GAP = 0.25  # [s]; trackers are slower than joints
 SHORTEST_SEGMENT = 1.0  # [s]
@@ -183,6 +188,9 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
 
     White noise s of a joint angle at the rate f_s, differentiated twice and cut at f_c, has the variance
     2 s^2 (2 pi)^4 f_c^5 / (5 f_s); it may reach a part of the largest accelerations recorded.
+
+    Nor does it reach beyond what torques tell in any of the recordings. A controller answers the noise of its encoders with
+    torques, so that noise is on both sides of a balance, and where there is nothing else masses come out of it.
     """
     contact = robot.contact
     # Slip stiffness 2 mu_p F_z / lambda_p over the relaxation length: the spring between wheel and ground, per unit mass.
@@ -191,7 +199,7 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
     for recording in recordings:
         joints = recording.joint_states
         rate = 1.0 / float(np.median(np.diff(joints.stamp)))
-        cutoffs.append(rate / 8.0)
+        cutoffs += [rate / 8.0, _torque_band(joints.effort, rate)]
         slow = SignalFilter(rate, min(5.0, rate / 8.0))
         for i in range(robot.n):
             angle = joints.position[:, i, DRIVE]
@@ -207,6 +215,29 @@ def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> f
             if noise > 0.0:
                 cutoffs.append((allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)
     return max(min(cutoffs), SMALLEST_CUTOFF if has_balance(robot, recordings) else SMALLEST_KINEMATIC_CUTOFF)
+
+
+def _torque_band(torque: FloatArray | None, rate: float) -> float:
+    """Highest frequency at which some joint's torque (T, n, 2) holds more than its noise [Hz]; without bound where none tells.
+
+    Noise is what it holds between frequencies that a robot on casters hardly moves at. By medians of short pieces: a caster
+    that flips now and then makes no band.
+    """
+    low, high = TORQUE_NOISE_BAND
+    if torque is None or rate < 4.0 * low:
+        return math.inf
+    found = []
+    for values in torque.reshape(len(torque), -1).T:
+        values = values[np.isfinite(values)]
+        if len(values) < LEAST_PIECES * PIECE * rate or np.ptp(values) == 0.0:
+            continue
+        frequency, power = signal.welch(values, rate, nperseg=round(PIECE * rate), average="median")
+        noise = float(np.median(power[(frequency >= low) & (frequency <= min(high, 0.4 * rate))]))
+        above = power > TORQUE_OVER_NOISE * noise
+        told = frequency[:-1][above[:-1] & above[1:] & (frequency[1:] < low)]
+        highest = float(told.max(initial=0.0))
+        found.append(math.inf if highest >= low - 2.0 / PIECE else highest)
+    return max(found, default=math.inf)
 
 
 def has_balance(robot: RobotDescription, recordings: Sequence[Recording]) -> bool:

@@ -151,7 +151,8 @@ def _gain(index: int, axis: int) -> Vary:
 def _suspension(differences: ChannelDifferences) -> list[VariedNumber]:
     """How far the chassis leans on its springs when it accelerates: anything between not at all and twice as described.
 
-    And how fast: springs, dampers and inertias about level axes are seldom measured.
+    And how fast: springs, dampers and inertias about level axes are seldom measured. What an IMU feels of its weight then is a
+    number of its own: it may stand elsewhere on a frame that gives way, or its driver may have taken gravity out.
     """
     layout, numbers = differences.model.layout, differences.model.numbers
     if not (layout.balanced or layout.imu):
@@ -163,6 +164,8 @@ def _suspension(differences: ChannelDifferences) -> list[VariedNumber]:
             found.append(VariedNumber(f"suspension.lean.{axis}", "s^2", 0.0, lean, _entry("lean", k)))
             deviation = FREQUENCY_DEVIATION * lean
             found.append(VariedNumber(f"suspension.detuning.{axis}", "s^2", 0.0, deviation, _entry("detuning", k)))
+            if layout.imu:
+                found.append(VariedNumber(f"imu.lean.{axis}", "s^2", 0.0, lean, _entry("imu_lean", k)))
     return found
 
 

@@ -197,7 +197,7 @@ class ModelNumbers:
         spring: of the chassis over each wheel [N/m].
         lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
             chassis leans on its springs (2,) [s^2]; detuning: how much more of it there is per relative change of the
-            frequencies of `sway`, times that change (2,) [s^2].
+            frequencies of `sway`, times that change (2,) [s^2]; imu_lean: how far it does by what an IMU feels (2,) [s^2].
         sway: frequencies and damping of that. A chassis that leans when it accelerates does so too where its wheels do not
             carry it at its centre of mass.
     """
@@ -223,6 +223,7 @@ class ModelNumbers:
     clock: FloatArray
     spring: float
     lean: FloatArray
+    imu_lean: FloatArray
     detuning: FloatArray
     sway: ChassisSway
 
@@ -263,6 +264,7 @@ class ModelNumbers:
             clock=np.zeros(2),
             spring=robot.wheel_suspension.stiffness,
             lean=np.zeros(2),
+            imu_lean=np.zeros(2),
             detuning=np.zeros(2),
             sway=ChassisSway.of(robot),
         )
@@ -561,19 +563,18 @@ def _leaning(numbers: ModelNumbers, rate: float, twist: FloatArray, twist_dot: F
     return leaning
 
 
-def _tilt(
-    numbers: ModelNumbers, rate: float, steer_angle: FloatArray, twist: FloatArray, felt: FloatArray
-) -> FloatArray | None:
-    """The vertical in the horizontal axes of the chassis (T, 2): how it leans as it accelerates, and where it stands."""
-    leaning = _leaning(numbers, rate, twist, felt)
-    if leaning is None:
-        return None
+def _tilt(numbers: ModelNumbers, leaning: FloatArray, lean: FloatArray, steer_angle: FloatArray) -> FloatArray:
+    """The vertical in the horizontal axes of the chassis (T, 2): how it leans as it accelerates, and where it stands.
+
+    Args:
+        leaning: (T, 2) [m], as of `_leaning`; lean: the number it was made with (2,) [s^2].
+    """
     heading = np.stack([np.cos(steer_angle), np.sin(steer_angle)], axis=2)
     aside = np.stack([-heading[:, :, 1], heading[:, :, 0]], axis=2)
     offset_x, offset_y = numbers.caster_offset.T[:, :, None]
     contact = (numbers.steer_axis + offset_x * heading + offset_y * aside).mean(axis=1)
     height, aside_of_it = numbers.height_of_mass, mass_centre(numbers, steer_angle) - contact
-    tilt: FloatArray = leaning / height - numbers.lean * GRAVITY / height**2 * aside_of_it
+    tilt: FloatArray = leaning / height - lean * GRAVITY / height**2 * aside_of_it
     return tilt
 
 
@@ -622,8 +623,10 @@ def rolling_state(
     offset = _offsets(numbers, steer_angle)
     twist, contradiction = twists(numbers, steer_angle, velocity, offset)
     twist_dot = derivative(twist, motion.rate)
-    tilt = _tilt(numbers, motion.rate, steer_angle, twist, _without(twist_dot, pull))
-    if tilt is not None:
+    leaning = _leaning(numbers, motion.rate, twist, _without(twist_dot, pull))
+    tilt = np.zeros((len(twist), 2))
+    if leaning is not None:
+        tilt = _tilt(numbers, leaning, numbers.lean, steer_angle)
         offset = _offsets(numbers, steer_angle, tilt)
         twist, contradiction = twists(numbers, steer_angle, velocity, offset)
         twist_dot = derivative(twist, motion.rate)
@@ -643,7 +646,7 @@ def rolling_state(
             torque = torque + around.torque
         force = _contact_forces(
             numbers.modules, numbers.steer_axis, offset, radius, steer_angle, velocity, motion.acceleration, torque, spin,
-            twist, felt, normal, np.zeros((len(twist), 2)) if tilt is None else tilt,
+            twist, felt, normal, tilt,
         )  # fmt: skip
     else:
         wrench = inertial_wrench(numbers, motion, steer_angle, twist, felt)
@@ -704,9 +707,10 @@ def channel_sides(
         along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x + numbers.accelerometer_bias[0]
         across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y + numbers.accelerometer_bias[1]
         sensed = np.stack([rate, along, across], axis=1)
-        if leaning is not None:
-            # A sensor that leans back feels a part of its weight.
-            sensed[:, 1:] += GRAVITY / numbers.height_of_mass * leaning
+        if numbers.imu_lean.any():
+            # A sensor that leans feels a part of its weight.
+            late = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
+            sensed[:, 1:] += GRAVITY * _tilt(numbers, late, numbers.imu_lean, state.steer_angle)
         predicted.append(sensed)
     if layout.pose:
         late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0
