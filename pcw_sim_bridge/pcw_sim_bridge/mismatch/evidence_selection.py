@@ -47,7 +47,7 @@ RESHAPINGS = 3  # the first under the noise that a wrong shape leaves, which mak
 GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
 SPLIT_AMONG = 12  # candidates that a term may have taken in
 GATHERED_AMONG = 2  # candidates that several terms may be parts of
-DERIVED_AFTER = 2  # rounds that did not settle; then columns are taken anew
+DERIVED_AFTER = 2  # rounds that did not settle; then columns are taken anew; after twice as many the next time
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
@@ -186,9 +186,8 @@ class EffectSearch:
         """
         reshapings = 0
         for count in range(EXACT_ROUNDS):
-            point = self.problem.point
-            # With the slopes of another place one arrives where those are level, and not where the error is least.
-            if point is not None and (not point.derived or count == 1 + DERIVED_AFTER):
+            known = self.problem.point is not None and self.problem.point.derived
+            if count == (2 * DERIVED_AFTER if known else DERIVED_AFTER):
                 self.problem = self.problem.derived()
             residual, cost = self._left_and_cost(instances)
             fit = self.whiten_at(residual).fit(instances)
@@ -196,7 +195,11 @@ class EffectSearch:
             before = self.problem, self._point
             for part in STEPS:
                 if not self._exact_at(fit, part):
-                    return instances
+                    if self.problem.point is None or self.problem.point.derived:
+                        return instances
+                    # With the slopes of another place one arrives where those are level, and not where the error is least.
+                    self.problem, again = self.problem.derived(), instances
+                    break
                 again = instances if reshapings == RESHAPINGS else self._reshaped(instances, residual, reshapings == 0)
                 left, cost = self._left_and_cost(again)
                 if self._error(left, residual) + 2.0 * cost <= allowed:
