@@ -224,7 +224,9 @@ def test_samples_after_gaps_are_whitened_as_well_as_those_before_them():
     assert np.cov(runs.T) == pytest.approx(np.eye(7), abs=0.06)
 
 
-def linear_problem(residual: np.ndarray, terms: dict[str, tuple[np.ndarray, float]], once: bool = False) -> RegressionProblem:
+def linear_problem(
+    residual: np.ndarray, terms: dict[str, tuple[np.ndarray, float]], once: bool = False, noisy: bool = False
+) -> RegressionProblem:
     """One channel of a measured side of size 1 and more, and terms by name: column (T,) and largest coefficient."""
     time = np.arange(len(residual)) / RATE
     return one_channel(
@@ -233,7 +235,7 @@ def linear_problem(residual: np.ndarray, terms: dict[str, tuple[np.ndarray, floa
         nuisances=(Nuisance("number", "1", 0.0, 1e-3, np.cos(0.3 * time)[:, None]),),
         terms=tuple(
             Term(name, ("axis",), (LinearParameter("size", "1", -limit, limit, 30.0),), ({},),
-                 lambda shape, column=column: column[:, None, None], once=once)
+                 lambda shape, column=column: column[:, None, None], once=once, noisy=noisy)
             for name, (column, limit) in terms.items()
         ),
         scale_deviation=0.01,
@@ -286,6 +288,16 @@ def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
         estimate = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))[0].estimates["size"]
         held += estimate.low <= 1.0 <= estimate.high
     assert 34 <= held <= 40
+
+
+def test_noise_in_its_columns_is_no_need_of_an_effect():
+    """Without it a number would be eight tolerances off; but one with the residual's own noise has to be more than that."""
+    time = np.arange(3000) / RATE
+    number = np.cos(0.3 * time)
+    left = 0.008 * number + 0.01 * np.random.default_rng(7).standard_normal(len(time))
+    effect = {"same": (number, 100.0)}
+    assert chosen(linear_problem(left, effect)) == ["same"]
+    assert chosen(linear_problem(left, effect, noisy=True)) == []
 
 
 def odds_of_second(residual: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, float]:

@@ -65,7 +65,10 @@ class EffectGates:
             floor = np.maximum(floor, self._details([instance]))
             share = float(np.max(sizes / np.maximum(floor, 1e-300)))
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
-            share = max(share, retunings[index] / self.settings.smallest_threshold)
+            needed = retunings[index] / self.settings.smallest_threshold
+            if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
+                needed = min(needed, float(np.max(sizes / np.maximum(self._least(instance) * remains, 1e-300))))
+            share = max(share, needed)
             shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
         return losses, held_out, shares
 
