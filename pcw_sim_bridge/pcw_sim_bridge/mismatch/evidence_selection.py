@@ -7,6 +7,7 @@
 3. Prune: drop every term whose loss in evidence stays below the threshold, that does not lower the error on held-out
    blocks, or that moves no channel by a fair part of what is left of it. Exchange terms where another one does better.
 4. Settle: make the problem exact at what is left, ask whether something that was dropped is missing now, and prune again.
+5. Ask of every effect whose work re-tuned numbers could do whether they do it as well once the problem is exact at those.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ RESHAPINGS = 3  # the first under the noise that a wrong shape leaves, which mak
 GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
 SPLIT_AMONG = 12  # candidates that a term may have taken in
 GATHERED_AMONG = 2  # candidates that several terms may be parts of
-DERIVED_AFTER = 2  # rounds that did not settle; then columns are taken anew; after twice as many the next time
+# After so many rounds that did not settle columns are taken anew; where they have been before, after twice as many.
+DERIVED_AFTER = 2
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
@@ -107,7 +109,7 @@ class EffectSearch:
         self.noise_gain = (0.0, 1.0)
 
     def run(self) -> Selection:
-        """Grow, calibrate, prune, settle."""
+        """Grow, calibrate, prune, settle, and drop what re-tuning does as well."""
         plain = self.problem
         for count in range(EXACT_ROUNDS):
             if count == DERIVED_AFTER:

@@ -709,8 +709,8 @@ def channel_sides(
         sensed = np.stack([rate, along, across], axis=1)
         if numbers.imu_lean.any():
             # A sensor that leans feels a part of its weight.
-            late = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
-            sensed[:, 1:] += GRAVITY * _tilt(numbers, late, numbers.imu_lean, state.steer_angle)
+            leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
+            sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, state.steer_angle)
         predicted.append(sensed)
     if layout.pose:
         late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0

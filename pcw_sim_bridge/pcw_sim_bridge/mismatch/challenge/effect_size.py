@@ -44,7 +44,8 @@ class EffectSize:
         size: see above; channel: the one in which it is largest.
         evidence: see above [nats].
         region: range of every variable where the effect is above the noise floor.
-        retuned: the re-tuning that hides it best, in the units of the analyser's `retuned`, by name.
+        retuned: how much further the run with it is re-tuned than the run without it, in the units of the analyser's
+            `retuned`, by name: what hides it best.
     """
 
     size: float
