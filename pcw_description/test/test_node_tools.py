@@ -175,6 +175,7 @@ def test_joint_states_are_read_by_name() -> None:
 # --- Running --------------------------------------------------------------------------------------------
 
 PROGRAM = """
+import gc
 import sys
 from pcw_description.errors import PcwError
 from pcw_description.nodes.node_tools import declare, run_node
@@ -196,6 +197,7 @@ class Probe(Node):
             raise RuntimeError("broken on purpose")
         if kind == "ends":
             self.finished = True
+            print(gc.get_freeze_count(), len(gc.get_objects()))
         print("working", flush=True)
 
     def close(self):
@@ -247,3 +249,10 @@ def test_exit_codes(kind: str, code: int, said: str, closed: bool) -> None:
     assert said in errors
     assert ("Traceback" in errors) == (code == 1)
     assert output.endswith("closed\n") == closed
+
+
+def test_collections_in_the_middle_of_a_period_are_short() -> None:
+    """What a node needs all its life is not looked through again and again."""
+    output, errors = start_probe("-p", "kind:=ends").communicate(timeout=DEADLINE)
+    kept, looked_through = map(int, output.split("\n")[0].split())
+    assert kept > 20 * looked_through, errors

@@ -45,6 +45,7 @@ from sensor_msgs.msg import JointState
 
 from pcw_description.errors import PcwError, nearest_name
 from pcw_description.one_thread import one_thread
+from pcw_description.short_collections import short_collections
 
 try:
     from rclpy.experimental.events_executor import EventsExecutor
@@ -105,6 +106,7 @@ def _spin(nodes: Sequence[Node], stop_requests: list[float]) -> None:
     try:
         for node in nodes:
             executor.add_node(node)
+        short_collections()
         # EventsExecutor.spin() of Jazzy may spin without calling anything; spin_once() is sound.
         while rclpy.ok() and not stop_requests and not _all_finished(nodes):
             executor.spin_once(timeout_sec=SPIN_TIMEOUT)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import gc
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from pcw_description.errors import PcwError
 from pcw_description.robot_description import RobotDescription
 from pcw_description.robot_file import load_robot
+from pcw_description.short_collections import short_collections
 
 from ..run_controllers import RunController, make_controller
 from ..sensors import JointReading
@@ -90,8 +90,7 @@ def _ready_controller(robot: RobotDescription) -> RunController:
     believed = dataclasses.replace(robot, physics=())
     still = np.zeros((robot.n, 2))
     make_controller("computed_torque", believed).command(JointReading(still, still, still), np.zeros(3), 0.01)
-    gc.collect()
-    gc.freeze()
+    short_collections()
     return make_controller("computed_torque", believed)
 
 

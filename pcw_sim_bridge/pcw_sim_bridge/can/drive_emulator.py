@@ -9,7 +9,6 @@ Faults come from the command line, a file, or standard input while it runs, one 
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import math
 import queue
@@ -25,6 +24,7 @@ import numpy as np
 from pcw_description.errors import PcwError
 from pcw_description.one_thread import one_thread
 from pcw_description.robot_file import load_robot
+from pcw_description.short_collections import short_collections
 
 from ..plants.factory import make_plant
 from ..plants.plant import PLANT_NAMES
@@ -272,8 +272,7 @@ def _run(options: argparse.Namespace, stopped: threading.Event) -> None:
     asked: queue.Queue[str] = queue.Queue()
     threading.Thread(target=_read_lines, args=(sys.stdin, asked), daemon=True).start()
     try:
-        gc.collect()
-        gc.freeze()  # the collector need not look through what is there now, which takes tens of milliseconds
+        short_collections()
         print(f"{len(emulated.drives)} drives of {file.name} on {', '.join(f'{b.interface} {b.channel}' for b in file.buses)}",
               flush=True)  # fmt: skip
         serve(emulated, transport, timer, planned, asked, options.duration, stopped)

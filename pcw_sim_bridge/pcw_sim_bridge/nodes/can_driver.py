@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import sys
 import threading
 import time
@@ -27,6 +26,7 @@ from pcw_description.nodes.node_tools import (
     run_node,
     stamp_to_ns,
 )
+from pcw_description.short_collections import short_collections
 
 from ..can.can_file import on_udp, read_can_file
 from ..can.can_robot import ENABLE_TIME, CanRobot, TimedReading
@@ -106,10 +106,7 @@ class CanDriverNode(RobustLifecycleNode):
             log = free_log_name(self._log_path) if self._log_path else None
             transport = PythonCanTransport(self._file.buses, log=log)
             self._can = CanRobot(self.robot, self._file, transport)
-            # What is there now stays: the collector need not look through it in the middle of a period, which takes tens of
-            # ms. From configure on the drives watch for heartbeats, so that the periods begin at once.
-            gc.collect()
-            gc.freeze()
+            short_collections()  # from configure on the drives watch for heartbeats, so that the periods begin at once
             self._can.configure()
         except PcwError as error:
             self.get_logger().error(f"not configured: {error}")
