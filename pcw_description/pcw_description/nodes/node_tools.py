@@ -18,6 +18,7 @@ A node's file needs no more than this:
 from __future__ import annotations
 
 import array
+import inspect
 import math
 import signal
 import sys
@@ -106,12 +107,21 @@ def _spin(nodes: Sequence[Node], stop_requests: list[float]) -> None:
     try:
         for node in nodes:
             executor.add_node(node)
+        _find_modules()
         short_collections()
         # EventsExecutor.spin() of Jazzy may spin without calling anything; spin_once() is sound.
         while rclpy.ok() and not stop_requests and not _all_finished(nodes):
             executor.spin_once(timeout_sec=SPIN_TIMEOUT)
     finally:
         executor.shutdown()
+
+
+def _find_modules() -> None:
+    """Let the first line of a log find its caller as fast as the next, and not look through all modules for 40 ms.
+
+    A warning is written in the middle of a period, and just when something is amiss.
+    """
+    inspect.getframeinfo(inspect.currentframe())  # type: ignore[arg-type]
 
 
 def _all_finished(nodes: Sequence[Node]) -> bool:

@@ -31,11 +31,11 @@ BOUND_MS = 8.0
 def closed_loop(options: argparse.Namespace) -> int:
     """Drive for the duration and print the ages of commands and the frames that were lost."""
     with tempfile.TemporaryDirectory() as folder, RosTest() as ros:
-        before = os.getloadavg()[0]
+        before, wakes = os.getloadavg()[0], LateWakes(options.priority)
         stack = Stack(ros, Path(folder), options)
         stack.drive_for(2.0)
         seconds = {name: -_processor_time(getattr(stack, name)) for name in ("emulator", "driver", "controller")}
-        with LateWakes(options.priority) as wakes:
+        with wakes:
             stack.drive_for(options.duration)
         message, values = stack.drives
         for name in seconds:

@@ -1,6 +1,7 @@
 """How late the computer wakes a process that only sleeps: what no program on it can be better than.
 
-    with LateWakes(priority=40) as wakes:
+    wakes = LateWakes(priority=40)
+    with wakes:
         ...
     print(wakes.largest)
 
@@ -27,15 +28,16 @@ class LateWakes:
     """
 
     def __init__(self, priority: int = 0) -> None:
-        """Take the real-time priority to sleep at; 0: an ordinary process."""
+        """Start the process, which takes a second; priority: real-time, to sleep at; 0: an ordinary process."""
         self.largest, self.count = 0.0, 0
         self._here, there = multiprocessing.Pipe()
         self._process = multiprocessing.get_context("spawn").Process(target=_sleep, args=(there, priority), daemon=True)
+        self._process.start()
+        self._here.recv()
 
     def __enter__(self) -> LateWakes:
         """Begin."""
-        self._process.start()
-        self._here.recv()
+        self._here.send(None)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -47,10 +49,11 @@ class LateWakes:
 
 
 def _sleep(pipe: Connection, priority: int) -> None:
-    """Sleep until told to end; send the largest delay [s] and how many were above `LATE`."""
+    """Wait until told to begin, then sleep until told to end; send the largest delay [s] and how many were above `LATE`."""
     if priority:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     pipe.send(None)
+    pipe.recv()
     largest, count = 0.0, 0
     while not pipe.poll():
         begun = time.monotonic()
