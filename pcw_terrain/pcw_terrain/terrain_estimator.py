@@ -9,7 +9,8 @@ Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (s
 - the filtered signals are sampled so far apart that their noise is independent, as blocks;
 - the noise of speeds and torques is measured from their second differences, and with it the filtered slip's, s, in lambda_p.
   It bends the curve's mean by g'' s^2 / 2, which is taken off:    g_c = g(x) - g''(x) s^2 / 2;
-  The curve's mean is bent as well by slip that moves within the filter's memory, which is put back;
+  The curve's mean is bent as well by slip that moves within the filter's memory, which is put back; what noise alone makes
+  it move is less than two blocks' noise, since filter and tyre carry noise from one to the next;
 - the equations are solved with an instrument, the mean of the slip two blocks before and after, whose noise is another one
   (further off where the tyre's relaxation carries noise along):
 
@@ -60,9 +61,14 @@ CORRELATION_SHARE = 0.005
 KNOWN_BLOCKS = 1.5
 # Noise is averaged over this time [s], and blocks count from when so much of it has passed.
 NOISE_MEMORY, NOISE_SETTLED = 0.5, 0.1
+# Above this part of the critical slip its noise bends the curve's mean in ways that are not corrected for: a lambda_p as small
+# as the noise is none that was seen.
+GREATEST_NOISE = 0.35
 # Blocks at fewer parts of the critical slip than this say little and make older ones forgotten more slowly.
 INFORMATIVE_SLIP = 0.3
 UNSTEADY_SLIP = 0.25
+# Slip and force of a block belong together to this part of what the slip moves by from block to block, without any noise.
+MOVING_ACCURACY = 0.1
 # Degrees of freedom that the expected size of the residuals counts for, besides those of the residuals.
 PRIOR_BLOCKS = 5.0
 # Residuals beyond so many standard deviations count as that many; so much of each is allowed for, and so much must add up.
@@ -260,10 +266,11 @@ def noise_gain(pole, dt):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def block_share(pole, rate, time):  # type: ignore[no-untyped-def]
+def block_share(pole, rate, time, apart):  # type: ignore[no-untyped-def]
     """Return the part of `noise_gain` that is left behind one more pole `rate` [1/s] (inf: none) and in the mean over `time`.
 
-    The ratio of two integrals over the spectrum, with omega = pole tan(angle).
+    Of two such means that begin `apart` [s] from each other it is the covariance. The ratio of two integrals over the
+    spectrum, with omega = pole tan(angle).
     """
     passed, all_of_it = 0.0, 0.0
     for k in range(SPECTRUM_POINTS):
@@ -273,7 +280,7 @@ def block_share(pole, rate, time):  # type: ignore[no-untyped-def]
         half = 0.5 * omega * time
         window = (math.sin(half) / half) ** 2
         all_of_it += density
-        passed += density * window / (1.0 + (omega / rate) ** 2)
+        passed += density * window * math.cos(omega * apart) / (1.0 + (omega / rate) ** 2)
     return passed / all_of_it
 
 
@@ -412,6 +419,8 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
         result[7] = WRONG_SIGN
     elif where >= GRID or sums[where, _BEYOND] < 3.0 or straight - least < BENT * scale:
         result[7] = TOO_LITTLE_SLIP
+    elif state[_SLIP_NOISE] > GREATEST_NOISE * critical:
+        result[7] = TOO_LITTLE_SLIP
     elif not (LEAST_FRICTION < mu < GREATEST_FRICTION):
         result[7] = AT_A_BOUND
     elif max(math.sqrt(slip_variance) / numbers[_SLIP_SPREAD], math.sqrt(mu_variance) / numbers[_FRICTION_SPREAD]) > allowed:
@@ -532,7 +541,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     now[:] = 0.0
     force = math.hypot(force_x, force_y)
     full_gain = noise_gain(pole, dt)
-    gain = full_gain * block_share(pole, math.inf, state[_BLOCK_TIME])
+    gain = full_gain * block_share(pole, math.inf, state[_BLOCK_TIME], 0.0)
     settled, slip_now = state[_NOISE_TIME] > NOISE_SETTLED, mean[5]
     usable = settled and abs(slip_now) <= 1.0 and speed > numbers[_LEAST_SPEED] and load > numbers[_LEAST_LOAD] and force > 0.0
     usable = usable and state[_KNOWN_FOR] >= KNOWN_BLOCKS * BLOCK_TIME_CONSTANTS / pole
@@ -549,12 +558,14 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     larger, smaller = state[_NOISE], state[_NOISE + 1]
     if abs(velocity) > abs(rolling):
         larger, smaller = smaller, larger
-    slip_gain, relaxed_blocks = gain, 0
+    relaxing, relaxed_blocks = math.inf, 0
     if numbers[_RELAXATION] > 0.0:
-        slip_gain = full_gain * block_share(pole, speed / numbers[_RELAXATION], state[_BLOCK_TIME])
+        relaxing = speed / numbers[_RELAXATION]
         relaxed_blocks = math.ceil(RELAXATION_LAG * numbers[_RELAXATION] / speed * pole / BLOCK_TIME_CONSTANTS)
-    slip_variance = slip_gain * (other * other * larger + smaller) / (speed * speed) * along * along
-    slip_variance += 1e-10
+    # Of the slip per unit of its gain: filter and tyre carry noise from one block to the next, and to its difference from it.
+    noise = full_gain * (other * other * larger + smaller) / (speed * speed) * along * along
+    slip_variance = noise * block_share(pole, relaxing, state[_BLOCK_TIME], 0.0) + 1e-10
+    together = noise * block_share(pole, relaxing, state[_BLOCK_TIME], state[_BLOCK_TIME])
     friction = sign * force / load
     per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
     ends = full_gain * BLOCK_ENDS_NOISE * per_time * per_time * state[_NOISE]
@@ -570,7 +581,9 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     # The mean of a curve is bent by noise, and the mean friction by slip that moves within the filter's memory, 2 / pole^2.
     now[6] = slip_variance
     if history[_HISTORY - 2, 5] > 0.0:
-        moved = (slip - history[_HISTORY - 2, 0]) ** 2 - slip_variance - history[_HISTORY - 2, 1]
+        now[1] += (MOVING_ACCURACY * (slip - history[_HISTORY - 2, 0])) ** 2
+        before = history[_HISTORY - 2, 1] - numbers[_SLIP_ACCURACY] ** 2
+        moved = (slip - history[_HISTORY - 2, 0]) ** 2 - slip_variance - before + 2.0 * together
         now[6] -= BLOCK_SPREAD * moved
         # Where it moves by half of itself between two blocks this is no longer the first term of a series.
         steady = UNSTEADY_SLIP * max(abs(slip), abs(history[_HISTORY - 2, 0])) + 4.0 * math.sqrt(slip_variance)
