@@ -1,6 +1,7 @@
 """Where and when something is at work that can be in too many places to be tried one by one."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.first_look import Looked, patches, waves, windows
+from pcw_sim_bridge.mismatch.first_look import Looked, orders, patches, waves, windows
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -115,3 +116,29 @@ def test_a_problem_is_exact_where_it_is_made_so(tmp_path: Path) -> None:
             left.append(float(np.std(explained[np.ix_(rows, slip)])))
     healthy, _, first_order, exactly = left
     assert exactly < 1.5 * healthy < first_order
+
+
+@pytest.mark.parametrize("order", [14.0, 21.0, 40.0])
+def test_a_ripple_is_found_though_it_passes_too_fast_to_be_seen_most_of_the_time(order: float) -> None:
+    time = np.arange(2400) / 20.0
+    is_slow = time % 10.0 < 2.5
+    angle = np.cumsum(np.where(is_slow, 1.0, 6.0) * (1.0 + 0.3 * np.sin(time))) / 20.0
+    rng = np.random.default_rng(int(order))
+    signal = np.where(is_slow, np.cos(order * angle + 0.7), 0.0) + 0.5 * rng.standard_normal(len(angle))
+    chosen = orders(signal, angle, 20.0)
+    assert np.abs(chosen.values - order).min() < math.pi / np.ptp(angle)
+    assert chosen.among > 100
+
+
+def test_samples_that_are_not_judged_do_not_say_how_fast_a_joint_turns() -> None:
+    time = np.arange(2400) / 20.0
+    is_still = time % 10.0 < 9.0
+    angle = np.cumsum(np.where(is_still, 0.0, 6.0)) / 20.0
+    chosen = orders(np.where(is_still, 0.0, np.cos(5.0 * angle)), angle, 20.0)
+    assert np.abs(chosen.values - 5.0).min() < math.pi / np.ptp(angle)
+
+
+def test_a_joint_that_hardly_turns_has_no_orders() -> None:
+    angle = np.linspace(0.0, 1.0, 500)
+    assert len(orders(np.sin(30.0 * angle), angle, 20.0).values) == 0
+    assert len(orders(np.zeros(500), 20.0 * angle, 20.0).values) == 0

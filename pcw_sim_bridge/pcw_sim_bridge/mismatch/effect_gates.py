@@ -119,11 +119,11 @@ class EffectGates:
         return 1.0 if self.problem.terms[instance.term].noisy else self.settings.smallest_share
 
     def _details(self, instances: Sequence[Instance]) -> FloatArray:
-        """What the model itself misjudges (C,), which is no effect: three deviations of its scale, and its slips.
+        """What the model itself misjudges (C,), which is no effect: two deviations of its scale, and its slips.
 
         What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that thrice.
         """
-        scale = 3.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
+        scale = 2.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
         if self.problem.misjudged is None:
             return scale
         noisy = any(self.problem.terms[instance.term].noisy for instance in instances)

@@ -20,6 +20,9 @@ from .regression_problem import BoolArray, FloatArray, Nuisance
 
 LARGEST_ORDER = 400.0
 MOST_ORDERS = 4
+# A ripple may show in this part of the samples alone, those in which the joint turns slowly.
+SLOW_PART = 0.1
+SAMPLES_PER_WAVE = 8.0
 # Pushes last so long [s]; patches of floor measure so much [m], on a grid of such cells.
 LONGEST_PUSH, SHORTEST_PUSH = 12.0, 0.4
 PATCHES = (0.12, 0.18, 0.27, 0.4, 0.6, 0.9)
@@ -96,21 +99,27 @@ def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
     Args:
         signal: zero where it is not to be judged.
         angle: of the joint [rad].
-        rate: samples per second: a wave that passes faster than half of it in most samples cannot be seen.
+        rate: samples per second: a wave that passes faster than half of it wherever the joint turns cannot be seen.
     """
     span = float(np.ptp(angle))
-    speed = float(np.median(np.abs(np.diff(angle)))) * rate
-    if span < math.tau or speed <= 0.0:
+    moved = np.abs(np.diff(angle))[signal[1:] != 0.0]
+    speed = float(np.quantile(moved, SLOW_PART)) * rate if len(moved) else 0.0
+    if span < math.tau:
         return Chosen(np.zeros(0), 1)
-    largest = min(math.pi * rate / speed, LARGEST_ORDER)
-    spacing = math.pi / (2.0 * span)
-    tried = np.arange(max(spacing, 0.5), largest, spacing)
+    largest = min(math.pi * rate / max(speed, 1e-9), LARGEST_ORDER)
+    # A signal over evenly spaced angles has its orders by one transform; each sample is shared by the two next to it.
+    density = SAMPLES_PER_WAVE * largest / math.tau
+    place = (angle - angle.min()) * density
+    before = place.astype(np.int64)
+    count = int(before.max()) + 2
+    part = place - before
+    along = np.bincount(before, (1.0 - part) * signal, count) + np.bincount(before + 1, part * signal, count)
+    power = np.abs(np.fft.rfft(along, 4 * count)) ** 2
+    tried = math.tau * density / (4 * count) * np.arange(len(power))
+    wanted = (tried >= max(tried[1], 0.5)) & (tried < largest)
+    tried, power = tried[wanted], power[wanted]
     if not len(tried):
         return Chosen(np.zeros(0), 1)
-    power = np.empty(len(tried))
-    for start in range(0, len(tried), 512):
-        some = tried[start : start + 512]
-        power[start : start + 512] = np.abs(np.exp(1j * np.outer(some, angle)) @ signal) ** 2
     found = []
     for _ in range(MOST_ORDERS):
         best = int(np.argmax(power))

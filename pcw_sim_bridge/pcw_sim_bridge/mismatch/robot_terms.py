@@ -157,8 +157,8 @@ class _TermMaker:
     def _orders(self, i: int, axis: int) -> Chosen:
         """Orders of the ripples that a torque at one joint would have to have, to be in what is left."""
         response = self.differences.of_unit_torque(i, axis)
-        signal = np.sum(self.looked.left[:, :3] * response[:, :3], axis=1)
-        return orders(signal, self.looked.angle[:, i, axis], self.looked.rate)
+        held, _ = self.looked.held_against(response[:, :, None])
+        return orders(held[:, 0], self.looked.angle[:, i, axis], self.looked.rate)
 
     # -- everything else ----------------------------------------------------------------------------------------
 
