@@ -196,9 +196,8 @@ def test_a_shape_that_is_tried_has_the_evidence_of_its_fit():
     regression = search.whiten_at(problem.residual)
     for others in ((), (Instance(0, (("phase", 2.3),), (0,)),)):
         trials = ShapeTrials(regression, others, Instance(0, (("phase", 0.5),), (0,)))
-        for phase in (0.5, 0.7, 1.0, 3.5):
-            instance = Instance(0, (("phase", phase),), (0,), occam=1.5)
-            evidence, allowed = trials.evidence(instance)
+        instances = [Instance(0, (("phase", phase),), (0,), occam=1.5) for phase in (0.5, 0.7, 1.0, 3.5)]
+        for instance, (evidence, allowed) in zip(instances, trials.evidence(instances), strict=True):
             fit = regression.fit([*others, instance])
             assert evidence == pytest.approx(fit.log_evidence, abs=1e-6)
             assert allowed == regression.each_within_bounds(fit)[-1]

@@ -18,7 +18,9 @@ import dataclasses
 import functools
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg
+
+from pcw_description.compiled import compiled
 
 from .regression_problem import BoolArray, FloatArray, IntArray, segment_slices
 
@@ -54,11 +56,9 @@ class NoiseModel:
 
         The first samples after a gap are foretold from as many as there are since, as well as these allow.
         """
-        result = np.zeros(values.shape)
-        for channel, taps in enumerate(self.taps):
-            position = _since_gap(valid[:, channel], segment)
-            result[:, channel] = _filter_matrix(np.trim_zeros(taps, "b").tobytes(), position.tobytes()) @ values[:, channel]
-        return result
+        position = _positions(valid.tobytes(), valid.shape, segment.tobytes())[0]
+        wide = np.ascontiguousarray(values.reshape(*valid.shape, -1), dtype=np.float64)
+        return _filtered(wide, position, *_weights(self.taps.tobytes(), self.taps.shape)).reshape(values.shape)
 
     def whiten(self, values: FloatArray, valid: BoolArray, segment: IntArray) -> FloatArray:
         """Return whitened values: (T, C) or (T, C, K) -> the same shape, zero where not valid.
@@ -68,18 +68,67 @@ class NoiseModel:
         if self.is_white:  # nothing ties a sample to others
             scale = np.where(valid, self.taps[:, 0], 0.0)
             return values * scale.reshape(*scale.shape, *(1,) * (values.ndim - 2))
-        filtered = self.filtered(values, valid, segment)
-        white = np.zeros_like(filtered)
-        codes = valid @ (1 << np.arange(valid.shape[1], dtype=np.int64))
-        for code in np.unique(codes):
-            if code == 0:
+        filtered = self.filtered(values, valid, segment).reshape(*valid.shape, -1)
+        _, pattern, present = _positions(valid.tobytes(), valid.shape, segment.tobytes())
+        roots = _inverse_roots(self.correlation.tobytes(), present.tobytes(), present.shape)
+        return _decorrelated(filtered, pattern, roots).reshape(values.shape)
+
+
+@compiled
+def _filtered(values, position, weights, lengths):  # type: ignore[no-untyped-def]
+    """Filter (T, C, K): at a position after a gap (T, C) with the weights (C, L, L) of that row."""
+    result = np.zeros_like(values)
+    for t in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            if position[t, c] < 0:
                 continue
-            rows = np.flatnonzero(codes == code)
-            present = np.flatnonzero(valid[rows[0]])
-            root = np.linalg.cholesky(self.correlation[np.ix_(present, present)])
-            decorrelated = np.linalg.inv(root) @ filtered[np.ix_(rows, present)].reshape(len(rows), len(present), -1)
-            white[np.ix_(rows, present)] = decorrelated.reshape(len(rows), len(present), *values.shape[2:])
-        return white
+            row = min(position[t, c], lengths[c] - 1)
+            for lag in range(row + 1):
+                weight = weights[c, row, lag]
+                for k in range(values.shape[2]):
+                    result[t, c, k] += weight * values[t - lag, c, k]
+    return result
+
+
+@compiled
+def _decorrelated(values, pattern, roots):  # type: ignore[no-untyped-def]
+    """Multiply the channels of each row (T, C, K) by the matrix (P, C, C) of its pattern."""
+    result = np.empty_like(values)
+    for t in range(values.shape[0]):
+        np.dot(roots[pattern[t]], values[t], result[t])
+    return result
+
+
+@functools.lru_cache(maxsize=8)
+def _positions(content: bytes, shape: tuple[int, int], segments: bytes) -> tuple[IntArray, IntArray, BoolArray]:
+    """Of valid samples (T, C): places after gaps (T, C), and the pattern (T,) of those present (P, C) in each row."""
+    valid, segment = np.frombuffer(content, dtype=np.bool_).reshape(shape), np.frombuffer(segments, dtype=np.int64)
+    position = np.stack([_since_gap(valid[:, c], segment) for c in range(shape[1])], axis=1)
+    present, pattern = np.unique(valid, axis=0, return_inverse=True)
+    return position, pattern.ravel(), present
+
+
+@functools.lru_cache(maxsize=64)
+def _weights(content: bytes, shape: tuple[int, int]) -> tuple[FloatArray, IntArray]:
+    """Of taps (C, L): weights (C, L, L), see `_weights_after_gaps`, and how many of each channel are not zero (C,)."""
+    taps = np.frombuffer(content).reshape(shape)
+    weights, lengths = np.zeros((*shape, shape[1])), np.zeros(shape[0], dtype=np.int64)
+    for channel, own in enumerate(taps):
+        trimmed = np.trim_zeros(own, "b")
+        lengths[channel] = len(trimmed)
+        weights[channel, : len(trimmed), : len(trimmed)] = _weights_after_gaps(trimmed)
+    return weights, lengths
+
+
+@functools.lru_cache(maxsize=64)
+def _inverse_roots(content: bytes, patterns: bytes, shape: tuple[int, int]) -> FloatArray:
+    """Inverse Cholesky roots (P, C, C) of a correlation (C, C), of the channels present in each pattern (P, C)."""
+    correlation = np.frombuffer(content).reshape(shape[1], shape[1])
+    roots = np.zeros((shape[0], shape[1], shape[1]))
+    for root, present in zip(roots, np.frombuffer(patterns, dtype=np.bool_).reshape(shape), strict=True):
+        there = np.flatnonzero(present)
+        root[np.ix_(there, there)] = np.linalg.inv(np.linalg.cholesky(correlation[np.ix_(there, there)]))
+    return roots
 
 
 def _since_gap(valid: BoolArray, segment: IntArray) -> IntArray:
@@ -89,21 +138,6 @@ def _since_gap(valid: BoolArray, segment: IntArray) -> IntArray:
     start = np.maximum.accumulate(np.where(begins, index, 0))
     position: IntArray = np.where(valid, index - start, -1)
     return position
-
-
-@functools.lru_cache(maxsize=256)
-def _filter_matrix(content: bytes, positions: bytes) -> sparse.csr_array:
-    """Matrix (T, T) that filters with taps (L,), both given by content, after gaps by fewer of them."""
-    taps, position = np.frombuffer(content), np.frombuffer(positions, dtype=np.int64)
-    weights = _weights_after_gaps(taps)
-    rows, columns, entries = [], [], []
-    for lag in range(len(taps)):
-        there = np.flatnonzero(position >= lag)
-        rows.append(there)
-        columns.append(there - lag)
-        entries.append(weights[np.minimum(position[there], len(taps) - 1), lag])
-    places = np.concatenate(rows), np.concatenate(columns)
-    return sparse.coo_array((np.concatenate(entries), places), shape=(len(position), len(position))).tocsr()
 
 
 def _weights_after_gaps(taps: FloatArray) -> FloatArray:

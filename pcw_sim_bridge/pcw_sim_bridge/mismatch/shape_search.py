@@ -11,7 +11,7 @@ interval is that of the profile likelihood: all else is fitted again at each val
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -37,11 +37,11 @@ def refined_shape(
         return instance
     trials = ShapeTrials(regression, others, instance)
     for sweep in range(SWEEPS):
-        before = trials.evidence(instance)[0]
+        before = trials.evidence([instance])[0][0]
         for name, (kind, spacing) in resolution.items():
             place = _Place(trials, instance, name, kind, bounded=True)
-            instance = place.moved(_largest(place.evidence, place.width(spacing), coarse and sweep == 0))
-        if len(resolution) < 2 or trials.evidence(instance)[0] < before + WORTH:
+            instance = place.moved(_largest(place, place.width(spacing), coarse and sweep == 0))
+        if len(resolution) < 2 or trials.evidence([instance])[0][0] < before + WORTH:
             break
     return instance
 
@@ -85,7 +85,7 @@ class _Place:
         self._name, self._kind = name, kind
         self._known: dict[float, float] = {}
         # A size that cannot be is no better an explanation for its larger evidence, unless no other is known.
-        self._bounded = bounded and trials.evidence(instance)[1]
+        self._bounded = bounded and trials.evidence([instance])[0][1]
 
     def width(self, spacing: float) -> float:
         """Distance of a neighbour on the grid."""
@@ -104,20 +104,29 @@ class _Place:
 
     def evidence(self, step: float) -> float:
         """Log evidence there; none where the size would have to be one that cannot be."""
-        if step not in self._known:
-            evidence, allowed = self._trials.evidence(self.moved(step))
-            self._known[step] = -math.inf if self._bounded and not allowed else evidence
+        self.look_at([step])
         return self._known[step]
 
+    def look_at(self, steps: Sequence[float]) -> None:
+        """Find the evidence at several steps at once, which takes hardly longer than at one."""
+        new = [step for step in dict.fromkeys(steps) if step not in self._known]
+        found = self._trials.evidence([self.moved(step) for step in new]) if new else []
+        for step, (evidence, allowed) in zip(new, found, strict=True):
+            self._known[step] = -math.inf if self._bounded and not allowed else evidence
 
-def _largest(evidence: Callable[[float], float], width: float, coarse: bool) -> float:
+
+def _largest(place: _Place, width: float, coarse: bool) -> float:
     """Step of largest evidence within a width to either side, or near the last one where the search is not coarse."""
     steps = np.linspace(-1.0, 1.0, COARSE) * width
-    spacing = float(steps[1] - steps[0])
-    best = max((float(s) for s in np.round(steps / spacing) * spacing), key=evidence) if coarse else 0.0
+    spacing, best = float(steps[1] - steps[0]), 0.0
+    if coarse:
+        grid = [float(step) for step in np.round(steps / spacing) * spacing]
+        place.look_at(grid)
+        best = max(grid, key=place.evidence)
     spacing *= 1.0 if coarse else 0.5
     for _ in range(PARABOLAS):
-        left, middle, right = evidence(best - spacing), evidence(best), evidence(best + spacing)
+        place.look_at([best - spacing, best, best + spacing])
+        left, middle, right = place.evidence(best - spacing), place.evidence(best), place.evidence(best + spacing)
         if max(left, right) > middle:
             best += spacing if right > left else -spacing
             continue
@@ -128,7 +137,7 @@ def _largest(evidence: Callable[[float], float], width: float, coarse: bool) -> 
         offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
         if -0.5 * bend * offset**2 >= WORTH:
             vertex = best + offset * spacing
-            if evidence(vertex) > middle:
+            if place.evidence(vertex) > middle:
                 best = vertex
         elif -0.5 * bend < WORTH:
             break

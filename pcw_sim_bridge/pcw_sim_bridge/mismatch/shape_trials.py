@@ -30,12 +30,16 @@ class ShapeTrials:
         self._lower, self._upper = np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
         self._without = regression.fit(others).log_evidence + term.log_prior
 
-    def evidence(self, instance: Instance) -> tuple[float, bool]:
-        """Log evidence of the set with an instance of that term, and whether its parameters are within their bounds."""
-        columns = self.regression.tried_columns(instance)
+    def evidence(self, instances: Sequence[Instance]) -> list[tuple[float, bool]]:
+        """Log evidence of the set with each of some instances of that term, and whether its parameters are within bounds."""
+        pieces = self.regression.tried_columns(instances)
+        columns = np.concatenate(pieces, axis=1)
         cross = linalg.solve_triangular(self._factor, self._design.T @ columns, lower=True)
         moment = columns.T @ self.regression.target[:, None]
-        gains, means = marginal_gains((columns.T @ columns)[None], cross, moment, self._projected, self._deviations)
-        mean = means[0, :, 0]
-        allowed = bool(np.all((mean >= self._lower) & (mean <= self._upper)))
-        return self._without + float(gains[0, 0]) - instance.occam, allowed
+        own = np.stack([piece.T @ piece for piece in pieces])
+        gains, means = marginal_gains(own, cross, moment, self._projected, self._deviations)
+        allowed = np.all((means[:, :, 0] >= self._lower) & (means[:, :, 0] <= self._upper), axis=1)
+        return [
+            (self._without + float(gain) - instance.occam, bool(within))
+            for instance, gain, within in zip(instances, gains[:, 0], allowed, strict=True)
+        ]

@@ -232,17 +232,24 @@ class WhitenedRegression:
         """Whitened exact columns of an instance's active parameters (R, active)."""
         return self._bank.columns(self._indices(instance))
 
-    def tried_columns(self, instance: Instance) -> FloatArray:
-        """The same of a shape that is only tried; the last ones are remembered."""
-        key = instance.term, instance.shape
-        if key in self._places:
-            return self.columns(instance)
-        if key not in self._tried:
-            self._tried[key] = self._rows(self.problem.tried_columns(*key))
-            while sum(columns.nbytes for columns in self._tried.values()) > TRIED_BYTES and len(self._tried) > 1:
-                self._tried.popitem(last=False)
-        self._tried.move_to_end(key)
-        return self._tried[key][:, list(instance.active)]
+    def tried_columns(self, instances: Sequence[Instance]) -> list[FloatArray]:
+        """The same of shapes of terms that are only tried, all at once; the last ones are remembered."""
+        keys = [(instance.term, instance.shape) for instance in instances]
+        known = {key: self._tried[key] for key in keys if key in self._tried}
+        new = [key for key in dict.fromkeys(keys) if key not in known and key not in self._places]
+        if new:
+            raw = [self.problem.tried_columns(*key) for key in new]
+            edges = np.cumsum([columns.shape[2] for columns in raw])[:-1]
+            known |= zip(new, np.split(self._rows(np.concatenate(raw, axis=2)), edges, axis=1), strict=True)
+        for key in known:
+            self._tried[key] = known[key]
+            self._tried.move_to_end(key)
+        while sum(columns.nbytes for columns in self._tried.values()) > TRIED_BYTES and len(self._tried) > 1:
+            self._tried.popitem(last=False)
+        return [
+            known[key][:, list(instance.active)] if key in known else self.columns(instance)
+            for key, instance in zip(keys, instances, strict=True)
+        ]
 
     def deviations(self, instances: Sequence[Instance]) -> FloatArray:
         """Prior deviations of nuisances and active parameters (k,)."""
