@@ -108,6 +108,10 @@ class HealthyChannels:
             retuned={n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)},
         )
 
+    def evidence(self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording]) -> float:
+        """What these runs cost against another description more than the healthy ones against their own [nats]."""
+        return max(self._cost(_build(nominal, recordings, self._cutoff))[0] - self._healthy_cost[0], 0.0)
+
     def _change(self, other: RegressionProblem) -> FloatArray:
         """What the residual of another run is more than that of the quiet one (T, C)."""
         length = min(len(self.problem.residual), len(other.residual), len(self._quiet.residual))
