@@ -261,6 +261,23 @@ def test_terms_that_undo_each_other_are_dropped_together():
     assert chosen(linear_problem(left + 2.0 * force, both)) == ["stronger"]
 
 
+@pytest.mark.parametrize(
+    ("drift", "named"),
+    [(None, []), ("scale", ["ripple"]), ("ripple", [])],
+)
+def test_a_small_effect_that_no_error_of_the_model_looks_like_counts(drift, named):
+    """Both are smaller than the model's error of scale; only one of them could be such an error, growing and shrinking."""
+    time = np.arange(3000) / RATE
+    columns = {"scale": np.sin(time) * (1.0 + 0.5 * np.cos(0.05 * time)), "ripple": np.sin(7.0 * time)}
+    noise = 0.01 * np.random.default_rng(4).standard_normal(len(time))
+    problem = linear_problem(
+        0.05 * (columns["scale"] + columns["ripple"]) + noise, {name: (column, 100.0) for name, column in columns.items()}
+    )
+    own = {"scale": np.sin(time), "ripple": columns["ripple"]}
+    drifts = None if drift is None else np.stack([np.sin(time), own[drift]], axis=1)[:, None, :]
+    assert chosen(dataclasses.replace(problem, drifts=drifts)) == named
+
+
 def test_what_happens_once_must_stand_above_other_bursts():
     """The model errs in bursts: a shape that fits one of five is no event, and it is one where there is no other."""
     rng = np.random.default_rng(3)

@@ -37,6 +37,7 @@ class EffectGates:
         losses, held_out = [], []
         own: list[FloatArray] = []
         net: list[FloatArray] = []
+        changes: list[FloatArray] = []
         retunings, bursts = [], []
         explained = predicted(self.problem, fit)
         position = len(self.problem.nuisances)
@@ -55,6 +56,7 @@ class EffectGates:
             own.append(self._sizes(part))
             # What a term does for the prediction is what the others cannot do in its place.
             change = explained - predicted(self.problem, without)
+            changes.append(change)
             net.append(self._sizes(change, _at_work(part) if once else None))
             bursts.append(0.5 * self._largest_burst(unexplained, _at_work(part)) if once else 0.0)
             retunings.append(retuning)
@@ -62,8 +64,7 @@ class EffectGates:
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
             floor = np.maximum(self._least(instance) * remains, self.settings.smallest_part * total)
-            floor = np.maximum(floor, self._details([instance]))
-            share = float(np.max(sizes / np.maximum(floor, 1e-300)))
+            share = self._share(regression, sizes, floor, changes[index], [instance])
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
             needed = retunings[index] / self.settings.smallest_threshold
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
@@ -104,12 +105,30 @@ class EffectGates:
             left_out = [instance for instance in instances if instance not in order[:count]]
             without = regression.fit(order[:count])
             least = max(self._least(instance) for instance in left_out)
-            change = self._sizes(explained - predicted(self.problem, without))
-            share = float(np.max(change / np.maximum(np.maximum(least * remains, self._details(left_out)), 1e-300)))
+            change = explained - predicted(self.problem, without)
+            share = self._share(regression, self._sizes(change), least * remains, change, left_out)
             retuning = regression.tolerance_cost(without) - cost
             if max(share, retuning / (len(left_out) * self.settings.smallest_threshold)) < 1.0:
                 return tuple(instance for instance in instances if instance in order[:count])
         return instances
+
+    def _share(
+        self,
+        regression: WhitenedRegression,
+        sizes: FloatArray,
+        floor: FloatArray,
+        change: FloatArray,
+        instances: Sequence[Instance],
+    ) -> float:
+        """Contribution of some instances, of sizes (C,), against the smallest that counts.
+
+        That is the floor (C,), and what the model itself misjudges, unless the change (T, C) does not look like it.
+        """
+        plain = float(np.max(sizes / np.maximum(floor, 1e-300)))
+        share = float(np.max(sizes / np.maximum(np.maximum(floor, self._details(instances)), 1e-300)))
+        if share >= 1.0 or plain < 1.0 or self.problem.drifts is None:
+            return share
+        return max(share, min(plain, regression.peculiar(change) / self.settings.least_peculiar))
 
     def _least(self, instance: Instance) -> float:
         """Part of what remains in some channel that a term must do at least.

@@ -233,7 +233,8 @@ class RegressionProblem:
         variables: what a leftover may depend on: name -> (T,).
         misjudged: standard deviation of what the model itself misjudges in each sample, besides noise (T, C); None: of none.
         scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
-            known no better, and an effect that is no larger is not told from it.
+            known no better, and an effect that is no larger and looks alike is not told from it.
+        drifts: columns (T, C, K) of the model's own errors, which may vary slowly; None: no effect looks otherwise than these.
         sites: where an unknown torque or force may act; None where nothing measured would show it.
         exact: (changes of nuisances by name, sizes of effects) -> residual (T, C) of the model with all of them at work, and
             the names of the nuisances that it holds; None from it where there is no such model, and instead of it where the
@@ -259,6 +260,7 @@ class RegressionProblem:
     variables: Mapping[str, FloatArray]
     misjudged: FloatArray | None = None
     scale_deviation: float = 0.0
+    drifts: FloatArray | None = None
     sites: Sites | None = None
     exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
     derive: Callable[[Mapping[str, float], Sequence[SizedTerm]], Mapping[str, FloatArray] | None] | None = None

@@ -49,6 +49,8 @@ SLOWER = 3.0  # so much less than the residual's is the cut-off of variables wit
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slips to and fro is less than at its average slip
 SHAKEN_PART = 0.05  # of the samples in which wheels shake is worth a word
+# What every model has a little wrong, of each wheel by itself, and not always by as much.
+DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_lateral_stiffness")
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
 
@@ -130,6 +132,7 @@ class RobotProblemBuilder:
             variables=self._variables(along),
             misjudged=self._misjudged(differences),
             scale_deviation=self._scale_deviation(),
+            drifts=_drifts(terms) if self.layout.balanced else None,
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
             exact=functools.partial(self._exact, differences, terms),
             derive=functools.partial(self._derive, differences, terms),
@@ -306,3 +309,10 @@ class RobotProblemBuilder:
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
         return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+
+
+def _drifts(terms: Sequence[Term]) -> FloatArray | None:
+    """Columns (T, C, K) of what the model itself has wrong; None without terms."""
+    own = [term for term in terms if term.effect in DRIFTING and len(term.target) == 1]
+    columns = [term.columns(term.shapes[0])[:, :, list(term.base_indices())] for term in own]
+    return np.concatenate(columns, axis=2) if columns else None

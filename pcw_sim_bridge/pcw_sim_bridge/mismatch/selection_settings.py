@@ -18,6 +18,8 @@ class SelectionSettings:
             the details that no model of a real machine gets right, and they repeat as faithfully as an effect does.
         smallest_part: a term must also move some channel by this part of what all effects together do: the shape of a
             large effect is itself only known so well, and its error must not be named a further effect.
+        least_peculiar: nats that a term smaller than what the model misjudges must have beside the model's own errors. What
+            healthy robots in other simulations than the model were given wrongly stayed below half of it.
         blocks: of the cross-validation.
         first_repeats: instances of a repeatable term in the first over-complete set; more would eat red noise line by line.
     """
@@ -27,6 +29,7 @@ class SelectionSettings:
     smallest_threshold: float = 9.0
     smallest_share: float = 0.25
     smallest_part: float = 0.02
+    least_peculiar: float = 100.0
     blocks: int = 10
     surrogates: int = 200
     largest_set: int = 16

@@ -12,6 +12,7 @@ as cheap as a fit.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from scipy import linalg, special, stats
 from .column_bank import ColumnBank
 from .noise_model import NoiseModel
 from .regression_problem import FloatArray, IntArray, RegressionProblem, Shape
+from .slow_drifts import beside, drifting_columns
 
 PIECE = 1.0  # of a recording, long enough for the errors of one to say little of the next [s]
 # Re-tuning that leaves less than this part of what an effect does may be all there is to it, the rest being curvature.
@@ -209,6 +211,15 @@ class WhitenedRegression:
         full = np.zeros(self.problem.residual.size)
         full[self._flat] = rows
         return full.reshape(self.problem.residual.shape)
+
+    @functools.cached_property
+    def _drifting(self) -> FloatArray:
+        """Whitened columns (R, K) of the model's own errors."""
+        return self._rows(drifting_columns(self.problem))
+
+    def peculiar(self, values: FloatArray) -> float:
+        """Evidence of a contribution (T, C) that the model's own errors, varying slowly, could not give [nats]."""
+        return 0.5 * beside(self._drifting, self._rows(values))
 
     def gather(self, values: FloatArray) -> FloatArray:
         """Inverse of `spread`: take the usable rows (R,) out of (T, C)."""
