@@ -13,6 +13,8 @@ from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
 # What happens once must explain so many times what is left anywhere: models err in bursts, and some shape fits one of them.
 ABOVE_BURSTS = 3.0
+# By so much more must effects stand out whose columns hold noise that the residual holds.
+NOISY_FACTOR = 3.0
 
 
 class EffectGates:
@@ -63,8 +65,8 @@ class EffectGates:
         total = np.sqrt(np.sum(np.square(own), axis=0))
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
-            floor = np.maximum(self._least(instance) * remains, self.settings.smallest_part * total)
-            share = self._share(regression, sizes, floor, changes[index], [instance])
+            floors = remains, self.settings.smallest_part * total
+            share = self._share(regression, [instance], changes[index], sizes, floors)
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
             needed = retunings[index] / self.settings.smallest_threshold
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
@@ -104,9 +106,8 @@ class EffectGates:
         for count in range(len(instances) - 1):
             left_out = [instance for instance in instances if instance not in order[:count]]
             without = regression.fit(order[:count])
-            least = max(self._least(instance) for instance in left_out)
             change = explained - predicted(self.problem, without)
-            share = self._share(regression, self._sizes(change), least * remains, change, left_out)
+            share = self._share(regression, left_out, change, self._sizes(change), (remains, np.zeros_like(remains)))
             retuning = regression.tolerance_cost(without) - cost
             if max(share, retuning / (len(left_out) * self.settings.smallest_threshold)) < 1.0:
                 return tuple(instance for instance in instances if instance in order[:count])
@@ -115,20 +116,25 @@ class EffectGates:
     def _share(
         self,
         regression: WhitenedRegression,
-        sizes: FloatArray,
-        floor: FloatArray,
-        change: FloatArray,
         instances: Sequence[Instance],
+        change: FloatArray,
+        sizes: FloatArray,
+        floors: tuple[FloatArray, FloatArray],
     ) -> float:
-        """Contribution of some instances, of sizes (C,), against the smallest that counts.
+        """Contribution of some instances, a change (T, C) of sizes (C,), against the smallest that counts.
 
-        That is the floor (C,), and what the model itself misjudges, unless the change (T, C) does not look like it.
+        That is what the model itself misjudges, unless the change does not look like it; and in any case a part of what
+        remains, the first of the floors (C,), and the second one.
         """
-        plain = float(np.max(sizes / np.maximum(floor, 1e-300)))
-        share = float(np.max(sizes / np.maximum(np.maximum(floor, self._details(instances)), 1e-300)))
-        if share >= 1.0 or plain < 1.0 or self.problem.drifts is None:
+        remains, part = floors
+        least = max(self._least(instance) for instance in instances)
+        floor = np.maximum(np.maximum(least * remains, part), self._details(instances))
+        share = float(np.max(sizes / np.maximum(floor, 1e-300)))
+        seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * remains, part), 1e-300)))
+        if share >= 1.0 or seen < 1.0 or self.problem.drifts is None:
             return share
-        return max(share, min(plain, regression.peculiar(change) / self.settings.least_peculiar))
+        wanted = self.settings.least_peculiar * (NOISY_FACTOR if self._are_noisy(instances) else 1.0)
+        return max(share, min(seen, regression.peculiar(change) / wanted))
 
     def _least(self, instance: Instance) -> float:
         """Part of what remains in some channel that a term must do at least.
@@ -145,8 +151,11 @@ class EffectGates:
         scale = 2.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
         if self.problem.misjudged is None:
             return scale
-        noisy = any(self.problem.terms[instance.term].noisy for instance in instances)
-        return np.maximum(scale, (3.0 if noisy else 1.0) * self._sizes(self.problem.misjudged))
+        return np.maximum(scale, (NOISY_FACTOR if self._are_noisy(instances) else 1.0) * self._sizes(self.problem.misjudged))
+
+    def _are_noisy(self, instances: Sequence[Instance]) -> bool:
+        """Whether some columns hold noise that the residual holds."""
+        return any(self.problem.terms[instance.term].noisy for instance in instances)
 
 
 def _at_work(part: FloatArray) -> BoolArray:

@@ -397,6 +397,8 @@ def _linear(parameter: EffectParameter, neutral: float, room: float) -> LinearPa
         return LinearParameter(
             parameter.name, parameter.unit, lower - there, upper - there, max(3.0 * _typical_inverse(parameter), room),
             origin=neutral, reciprocal=True, pole=parameter.pole,
+            # Of stiffness there may be none to be seen beside what the effect is: at a bound it would rule that out.
+            refinement=parameter.default is not None,
         )
     if parameter.squared:
         deviation = max(3.0 * parameter.typical**2, room)
