@@ -54,24 +54,24 @@ def rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed):  # type
     registration: rotation from the moments about the centroid, translation from the means.
     """
     n = len(steer_angle)
-    centre = np.empty((n, 2))
+    wheel = np.empty((n, 6))  # of each its centre, cosine and sine of its heading, and its velocity along base_link's axes
     mean_px, mean_py, mean_wx, mean_wy = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         c, s = math.cos(steer_angle[i]), math.sin(steer_angle[i])
         bx, by = caster_offset[i, 0], caster_offset[i, 1]
-        centre[i, 0] = steer_axis[i, 0] + bx * c - by * s
-        centre[i, 1] = steer_axis[i, 1] + bx * s + by * c
-        mean_px += centre[i, 0] / n
-        mean_py += centre[i, 1] / n
-        mean_wx += (c * sensed[i, 0] - s * sensed[i, 1]) / n
-        mean_wy += (s * sensed[i, 0] + c * sensed[i, 1]) / n
+        wheel[i, 0] = steer_axis[i, 0] + bx * c - by * s
+        wheel[i, 1] = steer_axis[i, 1] + bx * s + by * c
+        wheel[i, 2], wheel[i, 3] = c, s
+        wheel[i, 4] = c * sensed[i, 0] - s * sensed[i, 1]
+        wheel[i, 5] = s * sensed[i, 0] + c * sensed[i, 1]
+        mean_px += wheel[i, 0] / n
+        mean_py += wheel[i, 1] / n
+        mean_wx += wheel[i, 4] / n
+        mean_wy += wheel[i, 5] / n
     moment, spread = 0.0, 0.0
     for i in range(n):
-        c, s = math.cos(steer_angle[i]), math.sin(steer_angle[i])
-        px, py = centre[i, 0] - mean_px, centre[i, 1] - mean_py
-        wx = c * sensed[i, 0] - s * sensed[i, 1]
-        wy = s * sensed[i, 0] + c * sensed[i, 1]
-        moment += px * wy - py * wx
+        px, py = wheel[i, 0] - mean_px, wheel[i, 1] - mean_py
+        moment += px * wheel[i, 5] - py * wheel[i, 4]
         spread += px * px + py * py
     omega = moment / spread
     twist = np.empty(3)
@@ -80,9 +80,9 @@ def rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed):  # type
     twist[2] = omega
     slip = np.empty((n, 2))
     for i in range(n):
-        c, s = math.cos(steer_angle[i]), math.sin(steer_angle[i])
-        vx = twist[0] - omega * centre[i, 1]
-        vy = twist[1] + omega * centre[i, 0]
+        c, s = wheel[i, 2], wheel[i, 3]
+        vx = twist[0] - omega * wheel[i, 1]
+        vy = twist[1] + omega * wheel[i, 0]
         slip[i, 0] = sensed[i, 0] - (c * vx + s * vy)
         slip[i, 1] = sensed[i, 1] - (-s * vx + c * vy)
     normal_inverse = np.empty((3, 3))
