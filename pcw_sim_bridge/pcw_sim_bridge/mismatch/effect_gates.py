@@ -31,10 +31,13 @@ class EffectGates:
         if not instances:
             return [], [], []
         residual = regression.unwhitened_residual(fit)
-        # In full: weights that hold down outliers would hold down the very bursts that an event is measured against.
-        information = np.array([channel.information for channel in self.problem.channels])
-        unexplained = regression.noise.whiten(residual, self.problem.valid, self.problem.segment) ** 2 @ information
         remains = channel_deviations(residual, self.problem.valid)
+        # Outliers in full: weights that hold them down would hold down the very bursts that an event is measured against.
+        trust = np.array([channel.information for channel in self.problem.channels])
+        if self.problem.misjudged is not None:
+            trust = trust / (1.0 + (self.problem.misjudged / remains) ** 2)
+        white = regression.noise.whiten(residual, self.problem.valid, self.problem.segment)
+        unexplained = np.sum(trust * white**2, axis=1)
         full_scores = regression.block_scores(instances)
         losses, held_out = [], []
         own: list[FloatArray] = []

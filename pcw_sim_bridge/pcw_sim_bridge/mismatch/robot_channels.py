@@ -239,8 +239,11 @@ class RobotProblemBuilder:
                 bad = sudden_slip(motion.tracked_twist, rolled, motion.rate, reach, allowed)
             bad = bad | (motion.shaking > SHAKING_PART * allowed)
             # What a filter makes of forces that no model follows reaches beyond the slip itself.
-            reach_of_filter = round(RINGING * motion.rate / self.cutoff)
-            bad = ndimage.binary_dilation(bad, iterations=max(reach_of_filter, 1))
+            reach_of_filter = max(round(RINGING * motion.rate / self.cutoff), 1)
+            bad = ndimage.binary_dilation(bad, iterations=reach_of_filter)
+            # Between two slips it is felt from both, and there is no calm in less time than one of them takes to be forgotten.
+            calm = ndimage.binary_opening(np.pad(~bad, reach_of_filter, mode="edge"), iterations=reach_of_filter)
+            bad = ~calm[reach_of_filter:-reach_of_filter]
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
             pieces.append((bad[:, None] | ~known).astype(float))
