@@ -160,26 +160,36 @@ class EffectSearch:
         that is evidence enough for an effect that is well within a tolerance.
         """
         instances = selection.fit.instances
+        own: float | None = None
         for index, instance in enumerate(instances):
-            regression = selection.regression
             others = instances[:index] + instances[index + 1 :]
-            fit = regression.retuned_instead(selection.fit, index)
-            if fit is None:
+            instead = selection.regression.retuned_instead(selection.fit, index)
+            if instead is None:
                 continue
-            here = self.problem, self._point
-            for _ in range(EXACT_ROUNDS):
-                if not self._exact_at(fit):
-                    break
-                self.problem = self.problem.derived()
-                regression = regression.moved(self.problem)
-                fit = regression.fit(others)
-            loss = selection.fit.log_evidence - fit.log_evidence
+            evidence = self._exact_evidence(selection.regression, instead)
+            loss = selection.fit.log_evidence - evidence
+            if loss >= selection.threshold:
+                # What a fit promises where it is not exact, re-tuning has not got either.
+                own = self._exact_evidence(selection.regression, selection.fit) if own is None else own
+                loss = own - evidence
             if loss < selection.threshold:
                 self._note_drop(self.label(instance), loss, "re-tuning does the same")
+                self._exact_at(instead)
                 regression = self.whiten_at(self.residual_of(others))
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
-            self.problem, self._point = here
         return selection
+
+    def _exact_evidence(self, regression: WhitenedRegression, fit: Fit) -> float:
+        """Log evidence of a set where it is exact, and its columns with it."""
+        here = self.problem, self._point
+        for _ in range(EXACT_ROUNDS):
+            if not self._exact_at(fit):
+                break
+            self.problem = self.problem.derived()
+            regression = regression.moved(self.problem)
+            fit = regression.fit(fit.instances)
+        self.problem, self._point = here
+        return fit.log_evidence
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
         """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.

@@ -212,7 +212,8 @@ def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection
 def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
     """Return the explanation by these effects alone: fitted again, and what is left tested again."""
     search, threshold = explanation.search, explanation.selection.threshold
-    selection = search.conclude(instances, threshold)
+    selection = search.retuned_away(search.conclude(instances, threshold))
+    instances = selection.fit.instances
     result = OpenSetTest(search, selection.fit.instances).run(threshold)
     return dataclasses.replace(
         explanation,
