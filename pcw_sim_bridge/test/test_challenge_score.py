@@ -11,8 +11,10 @@ from scipy import stats
 
 from pcw_description import load_robot
 from pcw_description.robot_file import robot_to_mapping
+from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.challenge.judgement import Judgement
 from pcw_sim_bridge.mismatch.challenge.score import (
+    CaseSet,
     Figure,
     calibration_error,
     figures,
@@ -222,9 +224,9 @@ def test_the_page_has_every_figure_and_every_miss(tmp_path: Path) -> None:
     wrong = report(named("rolling_resistance", "rear_left"))
     cases = [(SINGLE, report(named())), (SINGLE, wrong), (answer("none"), report()), (SINGLE, None)]
     sealed = challenge(tmp_path / "ch", cases)
-    found = score(tmp_path / "ch", sealed, None, lambda message: None)
+    found = score([CaseSet(tmp_path / "ch", sealed)], lambda message: None)
     written, printed = page(found), text(found)
-    assert found.digest in written and "seed 5" in printed
+    assert found.sources[0].digest in written and "seed 5" in printed
     [misses] = [table for table in found.tables if table.title.startswith("Misses")]
     assert [row[0] for row in misses.rows] == ["case_0002", "case_0004"]
     row = next(line for line in written.splitlines() if line.startswith("| case_0002"))
@@ -237,14 +239,32 @@ def test_the_page_has_every_figure_and_every_miss(tmp_path: Path) -> None:
     assert confusion.rows[0] == ("drive_coulomb_friction", "2", "0", "1", "0", "rolling_resistance 1")
 
 
+def test_cases_of_several_seeds_are_counted_together(tmp_path: Path) -> None:
+    sealed = challenge(tmp_path / "one" / "ch", [(SINGLE, report(named()))])
+    wrong = report(named("rolling_resistance", "rear_left"))
+    more = challenge(tmp_path / "two" / "again", [(SINGLE, wrong), (answer("none"), report())])
+    sets = [CaseSet(tmp_path / "one" / "ch", sealed), CaseSet(tmp_path / "two" / "again", more)]
+    found = score(sets, lambda message: None)
+    [misses] = [table for table in found.tables if table.title.startswith("Misses")]
+    assert [row[0] for row in misses.rows] == ["again/case_0001"]
+    right = next(f for f in found.figures if f.section == 1 and f.label.startswith("right"))
+    assert right.value == 0.5
+    assert all(source.digest in page(found) for source in found.sources)
+
+
+def test_each_folder_has_its_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["challenge", "score", "one", "two", "--answers", "one.json"]) == 2
+    assert "--answers has 1 entries for 2 DIR; allowed: one for each" in capsys.readouterr().err
+
+
 def test_answers_that_are_not_those_sealed_are_refused(tmp_path: Path) -> None:
     sealed = challenge(tmp_path / "ch", [(SINGLE, report())])
     sealed.write_text(sealed.read_text().replace("drive_coulomb_friction", "rolling_resistance"))
     with pytest.raises(MismatchError, match="SHA-256"):
-        score(tmp_path / "ch", sealed, None, lambda message: None)
+        score([CaseSet(tmp_path / "ch", sealed)], lambda message: None)
     (tmp_path / "ch" / HASH_FILE).unlink()
     with pytest.raises(MismatchError, match=HASH_FILE):
-        score(tmp_path / "ch", sealed, None, lambda message: None)
+        score([CaseSet(tmp_path / "ch", sealed)], lambda message: None)
 
 
 def test_baselines_on_the_same_cases() -> None:

@@ -54,6 +54,7 @@ DERIVED_AFTER = 2
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
 STEADY = 0.2
+STEADY_EVIDENCE = 1.0  # nats; what a set is worth where it is exact is not asked for more exactly
 # So many times the noise is estimated again, until no channel's falls by more than this.
 SETTLING_ROUNDS, SETTLED = 8, 0.9
 
@@ -181,15 +182,18 @@ class EffectSearch:
 
     def _exact_evidence(self, regression: WhitenedRegression, fit: Fit) -> float:
         """Log evidence of a set where it is exact, and its columns with it."""
-        here = self.problem, self._point
+        here, evidence = (self.problem, self._point), fit.log_evidence
         for _ in range(EXACT_ROUNDS):
             if not self._exact_at(fit):
                 break
-            self.problem = self.problem.derived()
+            self.problem, before = self.problem.derived(), evidence
             regression = regression.moved(self.problem)
             fit = regression.fit(fit.instances)
+            evidence = fit.log_evidence
+            if abs(evidence - before) < STEADY_EVIDENCE:
+                break
         self.problem, self._point = here
-        return fit.log_evidence
+        return evidence
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
         """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.

@@ -18,7 +18,7 @@ from ..errors import MismatchError
 from .cases import LEAST_EVIDENCE, Answer
 from .judgement import OUTCOMES, Judgement, ParameterError
 from .run import BASELINES, REPORT, USAGE
-from .sealed_answers import open_sealed
+from .sealed_answers import open_sealed, sealed_hash
 
 Progress = Callable[[str], None]
 CONFIDENT = 0.8
@@ -59,37 +59,53 @@ class Table:
 
 
 @dataclasses.dataclass(frozen=True)
-class Score:
-    """Everything that `score` says."""
+class CaseSet:
+    """Cases of one `challenge make`: their folder, their sealed answers, and the reports (None: those in the folder)."""
+
+    folder: Path
+    answers: Path
+    reports: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """Where scored cases come from: the seed that they were drawn with, and the hash of the answers."""
 
     seed: int
     digest: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """Everything that `score` says."""
+
+    sources: tuple[Source, ...]
     figures: tuple[Figure, ...]
     tables: tuple[Table, ...]
     notes: tuple[str, ...]
 
 
-def score(folder: Path, answers: Path, reports: Path | None, progress: Progress) -> Score:
-    """Compare the reports of a folder of cases with the answers.
+def score(sets: Sequence[CaseSet], progress: Progress) -> Score:
+    """Compare the reports of one or more sets of cases with the answers.
 
     Raises:
-        MismatchError: the answers are not those that were sealed, or no case has a report.
+        MismatchError: the answers are not those that were sealed, or no case of a set has a report.
     """
-    sealed = open_sealed(answers, folder)
-    reports = reports or folder / "reports"
-    cases: list[Answer] = sealed["cases"]
-    reported = [a for a in cases if (reports / a["case"] / REPORT).exists()]
-    if not reported:
-        raise MismatchError(f"{reports} holds no report of these cases; allowed: after `challenge run`")
-    progress(f"{len(reported)} of {len(cases)} cases have a report")
-    judged = [_judgement(a, reports / a["case"]) for a in cases]
-    return Score(
-        seed=sealed["seed"],
-        digest=(folder / "answers.sha256").read_text(encoding="ascii").split()[0],
-        figures=tuple(figures(judged)),
-        tables=tuple(tables(judged)),
-        notes=tuple(_notes(judged)),
-    )
+    sources, judged = [], []
+    for cases in sets:
+        sealed = open_sealed(cases.answers, cases.folder)
+        reports = cases.reports or cases.folder / "reports"
+        answers: list[Answer] = sealed["cases"]
+        reported = [a for a in answers if (reports / a["case"] / REPORT).exists()]
+        if not reported:
+            raise MismatchError(f"{reports} holds no report of these cases; allowed: after `challenge run`")
+        progress(f"{cases.folder}: {len(reported)} of {len(answers)} cases have a report")
+        sources.append(Source(sealed["seed"], sealed_hash(cases.folder)))
+        own = [_judgement(a, reports / a["case"]) for a in answers]
+        if len(sets) > 1:  # a number of a case says nothing without its folder
+            own = [dataclasses.replace(j, answer={**j.answer, "case": f"{cases.folder.name}/{j.answer['case']}"}) for j in own]
+        judged += own
+    return Score(tuple(sources), tuple(figures(judged)), tuple(tables(judged)), tuple(_notes(judged)))
 
 
 def _judgement(answer: Answer, folder: Path) -> Judgement:

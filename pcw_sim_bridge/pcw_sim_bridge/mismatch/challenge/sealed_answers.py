@@ -52,6 +52,11 @@ def open_sealed(path: Path, folder: Path) -> dict[str, Any]:
     return answers
 
 
+def sealed_hash(folder: Path) -> str:
+    """Return the hash that the answers of a folder of cases were sealed with."""
+    return (folder / HASH_FILE).read_text(encoding="ascii").split()[0]
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is there whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)

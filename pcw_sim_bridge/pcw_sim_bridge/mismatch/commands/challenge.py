@@ -52,9 +52,11 @@ def _add_run(steps: Any) -> None:
 
 def _add_score(steps: Any) -> None:
     score = steps.add_parser("score", help="compare the reports with the answers")
-    score.add_argument("folder", type=Path, metavar="DIR", help="folder of the cases")
-    score.add_argument("--answers", required=True, type=Path, metavar="FILE", help="the sealed answers")
-    score.add_argument("--reports", type=Path, metavar="REPORTS", help="folder of the reports (default: DIR/reports)")
+    score.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="folder of the cases; several count together")
+    score.add_argument("--answers", required=True, nargs="+", type=Path, metavar="FILE", help="the sealed answers of each")
+    score.add_argument(
+        "--reports", nargs="+", type=Path, metavar="REPORTS", help="folder of the reports of each (default: DIR/reports)"
+    )
     score.add_argument("--markdown", type=Path, metavar="FILE", help="write the figures as a page, misses and all")
     score.add_argument("--quiet", action="store_true", help="no progress on standard error")
     score.set_defaults(run=_score, interrupted="nothing was written")
@@ -114,10 +116,15 @@ def _told(failed: list[str], count: int, done: str) -> int:
 
 
 def _score(options: argparse.Namespace) -> int:
-    from ..challenge.score import score
+    from ..challenge.score import CaseSet, score
     from ..challenge.score_page import page, text
 
-    scored = score(options.folder, options.answers, options.reports, _progress(options))
+    folders, reports = options.folders, options.reports or [None] * len(options.folders)
+    for option, given in (("--answers", options.answers), ("--reports", reports)):
+        if len(given) != len(folders):
+            raise MismatchError(f"{option} has {len(given)} entries for {len(folders)} DIR; allowed: one for each")
+    sets = [CaseSet(*entry) for entry in zip(folders, options.answers, reports, strict=True)]
+    scored = score(sets, _progress(options))
     if options.markdown is not None:
         options.markdown.parent.mkdir(parents=True, exist_ok=True)
         options.markdown.write_text(page(scored), encoding="utf-8")
