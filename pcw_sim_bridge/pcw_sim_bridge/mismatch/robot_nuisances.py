@@ -124,6 +124,25 @@ def _scaled(column: int, nominal: float) -> Vary:
     return vary
 
 
+def rotor_armature(robot: RobotDescription, axis: int) -> FloatArray:
+    """Return what the rotors of one kind do to the joints (n, 2, 2) [kg m^2]; those of coupled gears turn with both joints."""
+    inertia = np.array([(caster.rotors.drive, caster.rotors.steer)[axis] for caster in robot.casters])
+    turned = robot.gear_matrix[:, axis]
+    armature: FloatArray = inertia[:, None, None] * turned[:, :, None] * turned[:, None, :]
+    return armature
+
+
+def _rotor(armature: FloatArray, axis: int) -> Vary:
+    """Vary rotors in proportion, by what those of the first caster do to their own joint."""
+
+    def vary(numbers: ModelNumbers, step: float) -> None:
+        relative = step / armature[0, axis, axis]
+        for column, (row, other) in zip((5, 6, 7), ((0, 0), (0, 1), (1, 1)), strict=True):
+            numbers.modules[:, column] += relative * armature[:, row, other]
+
+    return vary
+
+
 def _radius(index: int) -> Vary:
     """Vary a wheel's radius in the kinematics and in the dynamics, which holds its own copy."""
 
@@ -212,10 +231,10 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
         ("wheel.inertia_axle", 4, first.wheel.inertia_axle),
     ):
         yield label, label, nominal, _scaled(column, nominal)
-    for rotor, column in (("drive", 5), ("steer", 7)):
-        inertia = float(numbers.modules[0, column])
-        if inertia > 0.0:
-            yield "rotors", f"rotors.{rotor}", inertia, _scaled(column, inertia)
+    for axis, rotor in enumerate(AXIS_NAMES):
+        armature = rotor_armature(robot, axis)
+        if armature[0, axis, axis] > 0.0:
+            yield "rotors", f"rotors.{rotor}", float(armature[0, axis, axis]), _rotor(armature, axis)
     for i, caster in enumerate(robot.casters):
         for axis, axis_name in enumerate(AXIS_NAMES):
             yield "torque_constant", f"torque_constant/{caster.name}_{axis_name}", 1.0, _gain(i, axis)

@@ -31,6 +31,7 @@ from .findings import InputFinding
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .robot_channels import SLIP_FRACTION, STILL_SPEED, RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
+from .robot_nuisances import rotor_armature
 from .robot_rollout import robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
@@ -244,8 +245,8 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
         "module.mass": first.module.mass,
         "module.inertia_zz": first.module.inertia_zz,
         "wheel.inertia_axle": first.wheel.inertia_axle,
-        "rotors.drive": float(robot.armature[0, DRIVE, DRIVE]),
-        "rotors.steer": float(robot.armature[0, STEER, STEER]),
+        "rotors.drive": float(rotor_armature(robot, DRIVE)[0, DRIVE, DRIVE]),
+        "rotors.steer": float(rotor_armature(robot, STEER)[0, STEER, STEER]),
     }
     scale = {
         name: _positive(retuned.get(name, value), value) / value if value > 0.0 else 1.0 for name, value in stated.items()
