@@ -359,6 +359,8 @@ class OpenSetTest:
         """Held-out gain [nats] and share of a function of one variable in one channel, fitted beside the set."""
         augmented = AugmentedFit(self.regression, instances, channel, functions)
         before, after = augmented.held_out_errors()
+        # Few samples and many functions leave less than noise does; held-out errors say how much less.
+        scale = max(after / self.regression.effective_rows, 1.0)
         weights = augmented.weights()
         valid = self.problem.valid[:, channel]
         total = float(np.sum(self.residual[valid, channel] ** 2))
@@ -372,7 +374,7 @@ class OpenSetTest:
             grid = np.linspace(knots[0], knots[-1], 61)
             shape = functions[order] @ weights
             curve = np.interp(grid, self.problem.variables[name][order], shape)
-        return 0.5 * (before - after), max(share, 0.0), (grid, curve)
+        return 0.5 * (before - after) / scale, max(share, 0.0), (grid, curve)
 
     def _vetoes(self, leftovers: Sequence[Leftover], threshold: float) -> list[tuple[Instance, str]]:
         """Instances that a leading dependence makes redundant and outdoes."""
