@@ -238,8 +238,6 @@ class LawSearch:
             sizes = [float(np.sqrt(np.mean(v[valid, channel] ** 2))) for v in (change, problem.measured, replaced)]
             size, signal, own = sizes
             enough = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
-            if problem.misjudged is not None:
-                enough = max(enough, float(np.sqrt(np.mean(problem.misjudged[valid, channel] ** 2))))
             if own > 0.0:
                 enough = min(enough, max(REPLACED_PART * own, problem.scale_deviation * signal))
             if size > max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), enough):
