@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed
+from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
+from pcw_sim_bridge.mismatch.rolling_model import ChannelLayout, ModelNumbers
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.simulated_run import record_run
 
@@ -86,6 +89,39 @@ def test_a_changed_number_is_its_nuisance(tmp_path: Path) -> None:
     moved = (plain.residual - varied.residual) / 0.02
     steer_zero = columns["steer_zero/front_right"]
     assert np.sqrt(np.mean((moved - steer_zero) ** 2)) < 0.05 * np.sqrt(np.mean(steer_zero**2))
+
+
+def test_a_moment_between_two_slips_is_not_calm() -> None:
+    bad = np.zeros(100, dtype=bool)
+    bad[[30, 50]] = True
+    felt = np.zeros(100, dtype=bool)
+    felt[25:56] = True  # five before the first and after the last, and the nine between them that are free of both
+    assert np.array_equal(disturbed(bad, 5), felt)
+    felt[36:49] = False
+    bad[50], bad[54], felt[56:60] = False, True, True  # thirteen between them are enough
+    assert np.array_equal(disturbed(bad, 5), felt)
+    assert not disturbed(np.zeros(100, dtype=bool), 5).any()
+
+
+@pytest.mark.parametrize("rotor", ["drive", "steer"])
+def test_rotors_of_coupled_gears_are_wrong_at_both_joints(rotor: str) -> None:
+    """A tenth more of their inertia is the same in the numbers of the model as in a description that holds it."""
+    robot = load_robot("xr4000")
+    assert robot.armature[0, 0, 1] != 0.0
+    differences = SimpleNamespace(
+        model=SimpleNamespace(layout=ChannelLayout(robot.caster_names, True, False, True), numbers=ModelNumbers.of(robot)),
+        motions=[SimpleNamespace(sampling=0.004)],
+    )
+    [number] = [n for n in varied_numbers(robot, differences) if n.label == f"rotors.{rotor}"]  # type: ignore[arg-type]
+    varied = ModelNumbers.of(robot)
+    number.vary(varied, 0.1 * number.nominal)
+    larger = [
+        dataclasses.replace(caster, rotors=dataclasses.replace(caster.rotors, **{rotor: 1.1 * getattr(caster.rotors, rotor)}))
+        for caster in robot.casters
+    ]
+    described = ModelNumbers.of(dataclasses.replace(robot, casters=tuple(larger)))
+    assert np.abs(described.modules - ModelNumbers.of(robot).modules).max() > 1e-5
+    assert varied.modules == pytest.approx(described.modules, rel=1e-12)
 
 
 @pytest.mark.parametrize("plant", ["reduced", "pybullet"])

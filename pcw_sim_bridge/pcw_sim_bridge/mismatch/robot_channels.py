@@ -241,12 +241,7 @@ class RobotProblemBuilder:
                 rolled = at_place(twist, numbers.tracked)
                 bad = sudden_slip(motion.tracked_twist, rolled, motion.rate, reach, allowed)
             bad = bad | (motion.shaking > SHAKING_PART * allowed)
-            # What a filter makes of forces that no model follows reaches beyond the slip itself.
-            reach_of_filter = max(round(RINGING * motion.rate / self.cutoff), 1)
-            bad = ndimage.binary_dilation(bad, iterations=reach_of_filter)
-            # Between two slips it is felt from both, and there is no calm in less time than one of them takes to be forgotten.
-            calm = ndimage.binary_opening(np.pad(~bad, reach_of_filter, mode="edge"), iterations=reach_of_filter)
-            bad = ~calm[reach_of_filter:-reach_of_filter]
+            bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
             pieces.append((bad[:, None] | ~known).astype(float))
@@ -315,6 +310,17 @@ class RobotProblemBuilder:
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
         return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+
+
+def disturbed(bad: BoolArray, reach: int) -> BoolArray:
+    """Return which samples (T,) feel what happens in bad ones (T,), through a filter that is felt so many samples away.
+
+    What a filter makes of forces that no model follows reaches beyond the slip itself. Between two slips both are felt, and
+    there is no calm in less time than one of them takes to be forgotten.
+    """
+    calm = ~ndimage.binary_dilation(bad, iterations=reach)
+    opened: BoolArray = ndimage.binary_opening(np.pad(calm, reach, mode="edge"), iterations=reach)
+    return ~opened[reach:-reach]
 
 
 def _drifts(terms: Sequence[Term]) -> FloatArray | None:
