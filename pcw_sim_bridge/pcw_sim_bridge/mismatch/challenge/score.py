@@ -69,9 +69,9 @@ class CaseSet:
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Where scored cases come from: the seed that they were drawn with, and the hash of the answers."""
+    """Where scored cases come from: how they were drawn, in words, and the hash of the answers."""
 
-    seed: int
+    drawn: str
     digest: str
 
 
@@ -100,7 +100,9 @@ def score(sets: Sequence[CaseSet], progress: Progress) -> Score:
         if not reported:
             raise MismatchError(f"{reports} holds no report of these cases; allowed: after `challenge run`")
         progress(f"{cases.folder}: {len(reported)} of {len(answers)} cases have a report")
-        sources.append(Source(sealed["seed"], sealed_hash(cases.folder)))
+        options = [f"{name} {', '.join(map(str, values))}" for name, values in sealed["options"].items()]
+        drawn = "; ".join([f"{len(answers)} cases, seed {sealed['seed']}", *options])
+        sources.append(Source(drawn, sealed_hash(cases.folder)))
         own = [_judgement(a, reports / a["case"]) for a in answers]
         if len(sets) > 1:  # a number of a case says nothing without its folder
             own = [dataclasses.replace(j, answer={**j.answer, "case": f"{cases.folder.name}/{j.answer['case']}"}) for j in own]

@@ -15,7 +15,7 @@ SECTIONS = {
 
 def text(score: Score) -> str:
     """Return everything as plain text."""
-    lines = [f"seed {source.seed}, answers {source.digest}" for source in score.sources]
+    lines = [f"{source.drawn}: answers {source.digest}" for source in score.sources]
     for section, title in SECTIONS.items():
         own = [figure for figure in score.figures if figure.section == section]
         lines += ["", f"{section}. {title}"]
@@ -32,9 +32,9 @@ def page(score: Score) -> str:
         "",
         "Written by `mismatch challenge score --markdown`; not edited by hand.",
         "",
-        "SHA-256 of the answers, published before the recordings were made:",
+        "SHA-256 of the answers, sealed before the recordings were made:",
         "",
-        *(f"- seed {source.seed}: `{source.digest}`" for source in score.sources),
+        *(f"- {source.drawn}: `{source.digest}`" for source in score.sources),
     ]
     for section, title in SECTIONS.items():
         own = [figure for figure in score.figures if figure.section == section]
