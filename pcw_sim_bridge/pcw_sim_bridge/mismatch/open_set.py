@@ -35,6 +35,8 @@ SMALLEST_GAIN = 10.0  # nats, on top of the threshold of the names
 # It must also reach this part of the measured signal. Below lie details that no description of a real machine holds (the
 # lean on its springs, the ripple of a filter); a tool that reports them on every healthy robot says nothing.
 SMALLEST_PART = 0.02
+# No wheel is rounder, and no floor is more even, than that what it rolls is known better than to this part of its way.
+ROUNDNESS = 2e-4
 LARGEST_LAWS = 2
 # So many variables of a channel are looked at closely, after a look at so many samples.
 MOST_PROMISING, PROMISING_SAMPLES = 4, 500
@@ -327,6 +329,8 @@ class OpenSetTest:
         smallest = SMALLEST_PART * float(np.std(self.problem.measured[valid, channel]))
         if self.problem.misjudged is not None:  # what the model cannot judge is no finding either
             smallest = max(smallest, float(np.sqrt(np.mean(self.problem.misjudged[valid, channel] ** 2))))
+        if self.problem.channels[channel].name.startswith("rolling_consistency"):
+            smallest = max(smallest, ROUNDNESS * float(np.sqrt(np.mean(self.problem.variables["speed"][valid] ** 2))))
         for name in self._promising(channel):
             functions, knots = self.bases[channel, name]
             gain, share, curve = self._dependence(channel, name, functions, knots, instances)

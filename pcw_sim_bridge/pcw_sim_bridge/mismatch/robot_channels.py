@@ -44,7 +44,6 @@ from .sudden_slip import sudden_slip
 SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
-ROUNDNESS = 2e-4  # of its speed: no wheel is rounder, and no floor is more even, than that its way is known any better
 TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
 SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
@@ -131,7 +130,7 @@ class RobotProblemBuilder:
             nuisances=nuisances,
             terms=terms,
             variables=self._variables(along),
-            misjudged=self._misjudged(differences, along),
+            misjudged=self._misjudged(differences),
             scale_deviation=self._scale_deviation(),
             drifts=_drifts(terms) if self.layout.balanced else None,
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
@@ -214,14 +213,12 @@ class RobotProblemBuilder:
         shared = self.robot.tolerance("torque_constant").value / float(np.sqrt(2 * self.robot.n))
         return float(np.hypot(shared, MODEL_DEVIATION)) if self.layout.balanced else 0.0
 
-    def _misjudged(self, differences: ChannelDifferences, along: Mapping[str, Sequence[FloatArray]]) -> FloatArray:
+    def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
         """What the model misjudges in each sample (T, C): slips, by a part of those there are, and what an IMU leans."""
         found = np.zeros_like(differences.predicted)
         slips = differences.predicted[:, self.layout.consistency]
         if slips.size:
-            slip = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
-            rolled = differences.filtered(along["speed"])[:, None]
-            found[:, self.layout.consistency] = np.hypot(slip, ROUNDNESS * rolled)
+            found[:, self.layout.consistency] = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
         if self.layout.imu:
             found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
         return found
