@@ -14,6 +14,8 @@ from pcw_description.effects.registry import get
 from pcw_description.robot_description import thinnest_module_inertia
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.all_cores import on_all_cores
+from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.explanation import NamedTerm
 from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
 from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
@@ -161,6 +163,30 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
     assert robot.casters[3].module.mass == pytest.approx(1.1 * THESIS.casters[3].module.mass)
     assert [tyre.lambda_p for tyre in robot.tyres] == pytest.approx([1.2 * tyre.lambda_p for tyre in THESIS.tyres])
     assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
+
+
+def test_numbers_that_no_description_holds_are_in_the_patch_as_effects(tmp_path: Path) -> None:
+    """A floor, a torque constant and a wheel's zero, each as a recording re-tunes it: simulated, the error is a tenth."""
+    off = {"ground.slope.x": 3e-3, "ground.slope.y": -2e-3, "steer_zero/rear_right": 4e-3}
+    off["torque_constant/rear_left_drive"] = 0.02
+    path = tmp_path / "run"
+    record_run(
+        with_deviations(THESIS, off), lambda t: min(t, 1.0) * np.array([0.4 * np.sin(t), 0.3, 0.3 * np.cos(t)]), 8.0, 2, path,
+        controlled_as=THESIS,
+    )  # fmt: skip
+    nominal = RobotSubject(THESIS)
+    opened = [nominal.open(path, "fit", {})]
+    problem = nominal.problem(opened)
+    search = EffectSearch(problem, np.random.default_rng(0))
+    fit = search.whiten_at(search.residual_of(())).fit(())
+    retuned = {n.name: n.nominal + float(change) for n, change in zip(problem.nuisances, fit.mean, strict=True)}
+    windows = nominal.windows(opened)
+    assert windows is not None
+    before, after = (
+        np.sqrt(np.nanmean(windows.relative(subject.rollout(windows))[:, 1]))
+        for subject in (nominal, nominal.patched([], retuned))
+    )
+    assert after < 0.1 * before
 
 
 # -- manoeuvres, intervals, places ------------------------------------------------------------------------------------

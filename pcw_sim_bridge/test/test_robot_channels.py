@@ -183,6 +183,23 @@ def test_effects_of_every_kind_that_the_description_holds_are_not_left_over(tmp_
     assert np.all(left[1] < 1.5 * left[2])
 
 
+def test_wheels_that_climb_slip_no_more_for_it(tmp_path: Path) -> None:
+    """Waves of the floor, in the file too: the wrench they push with is accounted for, and no slip is predicted from it."""
+    nominal = load_robot("thesis")
+    waves = {"name": "uneven_ground", "amplitude": 4e-3, "wavelength": 1.3, "direction": 0.4}
+    robot = dataclasses.replace(
+        nominal, physics=read_physics([{**waves, "target": list(nominal.caster_names)}], nominal.caster_names)
+    )
+    wavy, level = record(tmp_path / "wavy", robot, 7), record(tmp_path / "level", nominal, 7)
+    left = []
+    for described, recording in ((nominal, wavy), (robot, wavy), (nominal, level)):
+        problem = RobotProblemBuilder(described, [recording]).build(with_terms=False)
+        left.append(np.sqrt(np.mean(np.where(problem.valid, problem.residual, 0.0) ** 2, axis=0)))
+    assert np.all(left[0][:3] > 5.0 * left[2][:3])
+    assert np.all(left[1][:3] < 1.5 * left[2][:3])
+    assert np.all(left[1][3:11] < 10.0 * left[2][3:11]), "20 to 80 times as much if the push were a tyre's"
+
+
 def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path: Path) -> None:
     """b_x = 0 leaves no torque balance; the channels say so by their names, and no candidate is a torque."""
     recording = record(tmp_path, load_robot("thesis"), 5)

@@ -149,6 +149,31 @@ def test_stands_still_without_torque_and_resets_where_asked(engine: str) -> None
     plant.close()
 
 
+def test_stiff_tyres_under_light_wheels_do_not_chatter(engine: str) -> None:
+    """3 N m at every drive, tyres twenty times as stiff as described: from step to step slips and forces change by little."""
+    described = load_robot("thesis")
+    stiff = dataclasses.replace(
+        described.contact,
+        lambda_p=0.03, relaxation_length=0.004, lateral=dataclasses.replace(described.contact.lateral, lambda_p=0.03),
+    )  # fmt: skip
+    plant = make_plant(engine, dataclasses.replace(described, contact=stiff))
+    torque = np.zeros((4, 2))
+    torque[:, DRIVE] = 3.0
+    try:
+        plant.step(torque, 400)
+        forces, speeds = [], []
+        for _ in range(20):
+            plant.step(torque)
+            state = plant.state()
+            forces.append(state.contact_force[:, 0])
+            speeds.append(state.joint_velocity[:, DRIVE])
+        rolled = described.wheel_radius * np.array(speeds)
+        assert np.all(np.abs(np.diff(forces, axis=0)) < 0.02 * np.mean(np.abs(forces)))
+        assert np.all(np.abs(np.diff(rolled, 2, axis=0)) < 1e-4)
+    finally:
+        plant.close()
+
+
 def test_two_casters_cannot_stand(engine: str) -> None:
     """The error says what to use instead; NaN torque is refused."""
     robot = load_robot("thesis")

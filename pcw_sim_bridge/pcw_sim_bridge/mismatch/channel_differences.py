@@ -79,6 +79,16 @@ class ChannelDifferences:
             pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
         return self.filtered(pieces)
 
+    def of_climbing(self, i: int) -> FloatArray:
+        """What a slope of one along the heading of wheel i adds to the residual, (T, C)."""
+        pieces = []
+        for motion, around, plain, normal in zip(self.motions, self._around, self._sides, self.normal, strict=True):
+            climb = np.zeros(motion.position.shape) if around.climb is None else around.climb.copy()
+            climb[:, i, 0] -= normal[:, i]
+            measured, predicted = self.model.sides(motion, dataclasses.replace(around, climb=climb))
+            pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
+        return self.filtered(pieces)
+
     def of_torque(self, torques: Sequence[FloatArray]) -> FloatArray:
         """What torques on the joints add to the residual.
 

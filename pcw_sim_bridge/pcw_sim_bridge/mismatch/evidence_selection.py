@@ -50,6 +50,8 @@ SPLIT_AMONG = 12  # candidates that a term may have taken in
 GATHERED_AMONG = 2  # candidates that several terms may be parts of
 # After so many rounds that did not settle columns are taken anew; where they have been before, after twice as many.
 DERIVED_AFTER = 2
+# Effects of so little less evidence [nats] are alike, and at most so many are tried; those of so much less are not looked at.
+ALIKE, MOST_ALIKE, FAR = 10.0, 3, 30.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
@@ -132,7 +134,7 @@ class EffectSearch:
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
         threshold = self.calibrate(regression, instances)
-        return self.retuned_away(self.settle_on(self.prune(regression, instances, threshold), threshold))
+        return self.retuned_away(self.against_alike(self.settle_on(self.prune(regression, instances, threshold), threshold)))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
         """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
@@ -144,9 +146,11 @@ class EffectSearch:
             regression = self.whiten_at(self.residual_of(chosen))
             wider = self.grow(regression, chosen, threshold, settling=True) if count < SECOND_THOUGHTS else chosen
             if _terms(wider) != _terms(chosen):
-                here = self.problem, self._point
-                selection = self.prune(self.whiten_at(self.residual_of(wider)), wider, threshold)
-                if _terms(selection.fit.instances) != _terms(chosen):
+                here, under = (self.problem, self._point), self.whiten_at(self.residual_of(wider))
+                selection = self.prune(under, wider, threshold)
+                found = selection.fit.instances
+                # What was added may push out what is there, and then be dropped itself: that is no reason to name less.
+                if _terms(found) != _terms(chosen) and under.fit(found).log_evidence > under.fit(chosen).log_evidence:
                     continue
                 self.problem, self._point = here
             selection = self.prune(regression, chosen, threshold)
@@ -180,20 +184,68 @@ class EffectSearch:
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
         return selection
 
+    def against_alike(self, selection: Selection) -> Selection:
+        """Exchange an effect for one that does the same to first order, where that one does more when both are exact."""
+        instances = selection.fit.instances
+        for index, instance in enumerate(instances):
+            others = instances[:index] + instances[index + 1 :]
+            rivals = self._alike(selection, others, instance)
+            if not rivals:
+                continue
+            own = self._exact_evidence(selection.regression, selection.fit)
+            for rival in rivals:
+                evidence = self._exact_evidence(selection.regression, selection.regression.fit((*others, rival)))
+                if evidence < own + STEADY_EVIDENCE:
+                    continue
+                gain = evidence - own
+                self.progress(f"exchange {self.label(instance)} for {self.label(rival)}: {gain:.1f} nats where exact")
+                instead = self.settle_on(self.conclude((*others, rival), selection.threshold), selection.threshold)
+                if any(found.term == rival.term for found in instead.fit.instances):
+                    return instead
+        return selection
+
+    def _alike(self, selection: Selection, others: tuple[Instance, ...], own: Instance) -> list[Instance]:
+        """Effects that do an effect's work nearly as well, to the first order of one of the two."""
+        regression, terms = selection.regression, self.problem.terms
+        found = []
+        for candidate in regression.scan(others)[0]:
+            if not math.isfinite(candidate.gain) or candidate.instance.term == own.term:
+                continue
+            if not terms[candidate.instance.term].is_curved and not terms[own.term].is_curved:
+                continue
+            if self.repeats(candidate.instance, others):
+                continue
+            rival = refined_shape(regression, others, candidate.instance)
+            if regression.fit((*others, rival)).log_evidence > selection.fit.log_evidence - ALIKE:
+                found.append(rival)
+            if len(found) == MOST_ALIKE or candidate.gain < selection.losses[selection.fit.instances.index(own)] - FAR:
+                break
+        return found
+
     def _exact_evidence(self, regression: WhitenedRegression, fit: Fit) -> float:
-        """Log evidence of a set where it is exact, and its columns with it."""
-        here, evidence = (self.problem, self._point), fit.log_evidence
+        """Log evidence of a set where it is exact, and its columns with it: what is reached there, not what is promised."""
+        here, reached = (self.problem, self._point), -math.inf
         for _ in range(EXACT_ROUNDS):
             if not self._exact_at(fit):
                 break
-            self.problem, before = self.problem.derived(), evidence
+            self.problem = self.problem.derived()
             regression = regression.moved(self.problem)
             fit = regression.fit(fit.instances)
-            evidence = fit.log_evidence
-            if abs(evidence - before) < STEADY_EVIDENCE:
+            missing = self._point_of(fit) - fit.mean
+            promised = fit.log_evidence
+            there = promised - 0.5 * float(missing @ np.linalg.solve(fit.covariance, missing))
+            reached = max(reached, there)
+            if promised - there < STEADY_EVIDENCE:
                 break
         self.problem, self._point = here
-        return evidence
+        return reached if math.isfinite(reached) else fit.log_evidence
+
+    def _point_of(self, fit: Fit) -> FloatArray:
+        """Sizes (k,) of nuisances and effects where the problem is exact."""
+        point = self._point or {}
+        keys: list[object] = [nuisance.name for nuisance in self.problem.nuisances]
+        keys += [(instance.term, instance.shape, k) for instance in fit.instances for k in instance.active]
+        return np.array([point[key] for key in keys])
 
     def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
         """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.

@@ -24,6 +24,7 @@ from .law_search import FoundLaw, LawSearch
 from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .shape_search import refined_shape
 from .unknown_law import UNKNOWN, Law
 from .whitened_regression import Instance, WhitenedRegression
 
@@ -38,6 +39,8 @@ SMALLEST_PART = 0.02
 # No wheel is rounder, and no floor is more even, than that what it rolls is known better than to this part of its way.
 ROUNDNESS = 2e-4
 LARGEST_LAWS = 2
+# So many effects of the library are held against a law before it is called one from outside.
+LIBRARY_TRIALS = 3
 # So many variables of a channel are looked at closely, after a look at so many samples.
 MOST_PROMISING, PROMISING_SAMPLES = 4, 500
 # A closed form may leave this part more of what a curve explains.
@@ -115,6 +118,10 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
         if not law.counts:
             beliefs = {i.term: law.belief for i in law.withdrawn}
             break
+        listed = _in_library(search, selection, law)
+        if listed is not None:
+            selection = listed
+            continue
         before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
         search, selection, final = _adopted(search, selection, law)
         after = {i.term for i in selection.fit.instances}
@@ -141,6 +148,27 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
 def is_unknown(problem: RegressionProblem, instance: Instance) -> bool:
     """Whether an instance is a law outside the library."""
     return problem.terms[instance.term].effect == UNKNOWN
+
+
+def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> Selection | None:
+    """The selection with an effect of the library that does at least as well as a law; None if there is none.
+
+    The library was asked under the noise that everything unexplained looked like. Under what a law leaves it may answer.
+    """
+    _, with_law = _with_law(search, selection, found.law, found.names)
+    regression, names = with_law.regression, found.names
+    for candidate in regression.scan(names, only=range(len(search.problem.terms)))[0][:LIBRARY_TRIALS]:
+        if is_unknown(search.problem, candidate.instance) or search.repeats(candidate.instance, names):
+            continue
+        trial = (*names, refined_shape(regression, names, candidate.instance))
+        fit = regression.fit(trial)
+        if fit.log_evidence < with_law.fit.log_evidence or not regression.within_bounds(fit):
+            continue
+        chosen = search.retuned_away(search.settle_on(search.conclude(trial, selection.threshold), selection.threshold))
+        if any(instance.term == candidate.instance.term for instance in chosen.fit.instances):
+            search.progress(f"in the library after all: {search.label(trial[-1])}")
+            return chosen
+    return None
 
 
 def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tuple[EffectSearch, Selection, Law]:

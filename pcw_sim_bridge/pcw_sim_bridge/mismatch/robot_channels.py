@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import ndimage
 
+from pcw_description.contact.contact_model import LAMBDA, LATERAL_LAMBDA
 from pcw_description.effects.drive_coulomb_friction import SMOOTHING_SPEED
 from pcw_description.errors import PcwError
 from pcw_description.recording import Recording
@@ -40,8 +41,8 @@ from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, at_place, twists
 from .signal_filter import SignalFilter
 from .sudden_slip import sudden_slip
 
-# Slip that the linear model may hold: a floor and a part of the speed (real robots: robots.md, last entry).
-SLIP_FLOOR, SLIP_FRACTION = 0.03, 0.15
+# Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
+SLIP_FLOOR, SLIP_PART = 0.03, 0.75
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
 TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
@@ -231,8 +232,7 @@ class RobotProblemBuilder:
         for motion, known in zip(self.motions, differences.known, strict=True):
             twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
             slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
-            speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * reach
-            allowed = SLIP_FLOOR + SLIP_FRACTION * speed
+            allowed = allowed_slip(numbers, twist)
             bad = slip > allowed
             if not self.layout.redundant:
                 rolled = at_place(twist, numbers.tracked)
@@ -307,6 +307,14 @@ class RobotProblemBuilder:
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
         return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+
+
+def allowed_slip(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
+    """Return the largest slip (T,) that the model may hold, in a motion of the twists (T, 3) [m/s]."""
+    reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
+    speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * reach
+    allowed: FloatArray = SLIP_FLOOR + SLIP_PART * float(np.min(numbers.tyres[:, [LAMBDA, LATERAL_LAMBDA]])) * speed
+    return allowed
 
 
 def disturbed(bad: BoolArray, reach: int) -> BoolArray:

@@ -247,10 +247,14 @@ class ChannelModel:
             height[:, i] += found[:, HEIGHT] + found[:, RADIUS_CHANGE]
         if height.any():
             normal = normal_along(motion, self.numbers, height)
+        climb = around.climb
         for i, found in under.items():
             torque[:, i, DRIVE] -= normal[:, i] * found[:, RADIUS_SLOPE]
-            torque[:, i, DRIVE] += self._climbing(motion, i, normal[:, i], found)
-        return dataclasses.replace(around, torque=torque, radius=radius, grip=grip, height=height)
+            gradient = found[:, [GRADIENT_X, GRADIENT_Y]]
+            if gradient.any():
+                climb = np.zeros(shape) if climb is None else climb.copy()
+                climb[:, i] -= normal[:, i, None] * self._in_wheel_frame(motion, i, gradient)
+        return dataclasses.replace(around, torque=torque, radius=radius, grip=grip, height=height, climb=climb)
 
     def around_leaning(self, motion: RobotMotion, around: Surroundings, change: FloatArray) -> Surroundings:
         """Return the surroundings with gravity whose unit vector leans further by `change` (3,), in axes of the yaw."""
@@ -275,12 +279,11 @@ class ChannelModel:
         )  # fmt: skip
         return found
 
-    def _climbing(self, motion: RobotMotion, i: int, normal: FloatArray, found: FloatArray) -> FloatArray:
-        """Drive torque (T,) that would push like a wheel's load on sloping ground; the side force is in the steering's."""
+    def _in_wheel_frame(self, motion: RobotMotion, i: int, vectors: FloatArray) -> FloatArray:
+        """Vectors of the world (T, 2) in the frame of wheel i (T, 2)."""
         heading = motion.pose[:, 2] + motion.position[:, i, STEER]
-        slope = np.cos(heading) * found[:, GRADIENT_X] + np.sin(heading) * found[:, GRADIENT_Y]
-        torque: FloatArray = -self.numbers.radius[i] * normal * slope
-        return torque
+        c, s = np.cos(heading), np.sin(heading)
+        return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)
 
     def sides(self, motion: RobotMotion, around: Surroundings, numbers: ModelNumbers | None = None) -> Sides:
         """Measured and predicted side of every channel along a true motion, (T, C) each."""

@@ -15,7 +15,7 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDes
 from ..plants.reduced import ReducedPlant, WindowStarts
 from ..plants.true_robot import as_it_really_is
 from .regression_problem import BoolArray, FloatArray, IntArray
-from .robot_channels import SLIP_FLOOR, SLIP_FRACTION, STILL_SPEED
+from .robot_channels import STILL_SPEED, allowed_slip
 from .robot_effects import true_motion, with_pose
 from .robot_motion import LARGEST_CUTOFF, RobotMotion, read_motions
 from .rolling_model import ModelNumbers, twists
@@ -143,9 +143,7 @@ def _sliding(numbers: ModelNumbers, motion: RobotMotion) -> BoolArray:
     """Rows (T,) with gross slip, by the measure of the channels."""
     twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
     slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
-    reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
-    speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * reach
-    return np.asarray(slip > SLIP_FLOOR + SLIP_FRACTION * speed)
+    return np.asarray(slip > allowed_slip(numbers, twist))
 
 
 def _signals(part: RobotPart, position: FloatArray, velocity: FloatArray, path: FloatArray) -> FloatArray:

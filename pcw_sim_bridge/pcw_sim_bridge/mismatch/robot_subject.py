@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,11 @@ from ..plants.true_robot import as_it_really_is
 from .command_tracking import command_problems
 from .errors import MismatchError
 from .findings import InputFinding
+from .found_effect import effect_instance
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
-from .robot_channels import SLIP_FRACTION, STILL_SPEED, RobotProblemBuilder
+from .robot_channels import STILL_SPEED, RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
-from .robot_nuisances import rotor_armature
+from .robot_nuisances import FLOOR, rotor_armature
 from .robot_rollout import robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
@@ -39,6 +41,7 @@ from .subject import Opened
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
+CONTRADICTORY = 0.15  # of their speed, by which wheels of one robot do not contradict each other most of the time
 
 
 class RobotSubject:
@@ -70,7 +73,7 @@ class RobotSubject:
         self._check_sensors(path, recording)
         warnings = [f"{warning.topic}: {warning.text}" for warning in found]
         apart = _contradiction(self._seen_robot(), recording)
-        if apart > SLIP_FRACTION:
+        if apart > CONTRADICTORY:
             warnings.append(
                 f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
                 "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
@@ -228,7 +231,8 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
 
     Args:
         robot: the robot.
-        retuned: by the names that the findings give them; those that are no number of the description change nothing.
+        retuned: by the names that the findings give them. Wheels read turned, torque constants and the floor's slope are no
+            numbers of a description and become effects; what an IMU or a clock says moves no robot and changes nothing.
     """
     chassis = robot.chassis
     x, y, z = chassis.com
@@ -277,7 +281,21 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
         return _possible(new)
 
     robot = dataclasses.replace(robot, chassis=chassis, casters=tuple(caster(old) for old in robot.casters))
-    return _with_tyres(robot, retuned)
+    return _with_tyres(dataclasses.replace(robot, physics=(*robot.physics, *_small_effects(robot, retuned))), retuned)
+
+
+def _small_effects(robot: RobotDescription, retuned: Mapping[str, float]) -> Iterator[EffectInstance]:
+    """Effects that stand for re-tuned numbers for which a description has no place."""
+    for name in robot.caster_names:
+        if turned := retuned.get(f"steer_zero/{name}", 0.0):
+            yield effect_instance("steer_zero_offset", (name,), {"offset": -turned})
+        for axis in AXIS_NAMES:
+            if error := retuned.get(f"torque_constant/{name}_{axis}", 1.0) - 1.0:
+                yield effect_instance("torque_constant_error", (name,), {"error": error}, axis)
+    along, across = (retuned.get(name, 0.0) for name in FLOOR)
+    if along or across:
+        slope = {"angle": math.hypot(along, across), "direction": math.atan2(across, along)}
+        yield effect_instance("ground_slope", ("chassis",), slope)
 
 
 def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotDescription:

@@ -245,20 +245,9 @@ class _TermMaker:
             columns = [self._difference(effect, (caster,), None, everywhere, neutral, name) for caster in casters]
             found = patches(self.looked, np.stack(columns, axis=2))
         else:
-            found = waves(self.looked, self._climbing())
+            climbing = [self.differences.of_climbing(i) for i in range(self.robot.n)]
+            found = waves(self.looked, np.stack(climbing, axis=2))
         return dataclasses.replace(found, shapes=tuple({**rest, **shape} for shape in found.shapes))
-
-    def _climbing(self) -> FloatArray:
-        """What a slope of one along each wheel's heading adds to the channels (T, C, n)."""
-        radius, columns = self.robot.wheel_radius, []
-        for i in range(self.robot.n):
-            torques = []
-            for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
-                torque = np.zeros((*motion.position.shape, 1))
-                torque[:, i, 0, 0] = -radius[i] * normal[:, i]
-                torques.append(torque)
-            columns.append(self.differences.of_torque(torques)[:, :, 0])
-        return np.stack(columns, axis=2)
 
     def _difference(
         self, effect: Effect, target: tuple[str, ...], axis: str | None, at: Shape, neutral: Mapping[str, float], name: str

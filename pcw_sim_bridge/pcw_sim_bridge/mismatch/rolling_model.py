@@ -162,6 +162,7 @@ class Surroundings:
         radius: change of the rolling radius (T, n) [m].
         grip: factor on the friction under each wheel (T, n).
         height: of the ground under each wheel, and of what it is larger by (T, n) [m].
+        climb: force of sloping ground through each wheel's centre, in the wheel frames (T, n, 2) [N].
         pull: of gravity along base_link's axes (T, 2) [m/s^2].
         straight: the tyres' curves straightened about where they are without a small change; None: the curves themselves.
     """
@@ -170,6 +171,7 @@ class Surroundings:
     radius: FloatArray | None = None
     grip: FloatArray | None = None
     height: FloatArray | None = None
+    climb: FloatArray | None = None
     pull: FloatArray | None = None
     straight: StraightTyres | None = None
 
@@ -589,7 +591,8 @@ class RollingState:
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
         grip, speed: load times friction factor [N] and rolling speed [m/s] (T, n + k), fixed axles last.
         spin: torque of the ground on each wheel about the vertical (T, n) [N m].
-        force: contact forces in the wheel frames (T, n + k, 2) [N].
+        force: of the tyres in the wheel frames (T, n + k, 2) [N].
+        load: the same with what sloping ground pushes besides, which is what the base feels (T, n + k, 2) [N].
     """
 
     steer_angle: FloatArray
@@ -603,6 +606,7 @@ class RollingState:
     speed: FloatArray
     spin: FloatArray
     force: FloatArray
+    load: FloatArray
 
 
 def rolling_state(
@@ -644,14 +648,22 @@ def rolling_state(
         torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
         if around.torque is not None:
             torque = torque + around.torque
-        force = _contact_forces(
+        if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
+            torque = torque.copy()
+            torque[:, :, DRIVE] += radius * around.climb[:, :, 0]
+        load = _contact_forces(
             numbers.modules, numbers.steer_axis, offset, radius, steer_angle, velocity, motion.acceleration, torque, spin,
             twist, felt, normal, tilt,
         )  # fmt: skip
+        force = load if around.climb is None else load - around.climb
     else:
         wrench = inertial_wrench(numbers, motion, steer_angle, twist, felt)
-        force = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, wrench)
-    return RollingState(steer_angle, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force)
+        if around.climb is not None:
+            wrench = wrench - _wrench_of(numbers.steer_axis, offset, steer_angle, around.climb, np.zeros_like(spin))
+        force = load = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, wrench)
+    return RollingState(
+        steer_angle, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force, load
+    )
 
 
 def _without(twist_dot: FloatArray, pull: FloatArray) -> FloatArray:
@@ -689,7 +701,7 @@ def channel_sides(
     measured, predicted = [], []
     if layout.balanced:
         measured.append(
-            _wrench_of(numbers.steer_axis, state.offset, state.steer_angle, state.force, state.spin)
+            _wrench_of(numbers.steer_axis, state.offset, state.steer_angle, state.load, state.spin)
         )
         wrench = inertial_wrench(numbers, motion, state.steer_angle, twist, twist_dot)
         if leaning is not None:

@@ -29,6 +29,8 @@ from .slow_drifts import beside, drifting_columns
 PIECE = 1.0  # of a recording, long enough for the errors of one to say little of the next [s]
 # Re-tuning that leaves less than this part of what an effect does may be all there is to it, the rest being curvature.
 RETUNED_SHARE = 0.05
+# By so much more may a size come out to first order than there can be: numbers beside it multiply it.
+CURVED_ROOM = 2.0
 TRIED_BYTES = 2**26  # of columns of shapes that were only tried
 Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 
@@ -409,14 +411,15 @@ class WhitenedRegression:
                     [[self._places[key].start + i for i in problem.terms[key[0]].base_indices()] for key in keys],
                     dtype=np.int64,
                 )
+                room = np.array([[self._room(index)] for index, _ in keys])
                 self._short_scans.append(_ScanGroup(
                     keys=tuple(keys),
                     term=np.array([index for index, _ in keys]),
                     columns=places,
                     gram=self._bank.own_grams(places),
                     deviations=self._per_key(keys, "deviation"),
-                    lower=self._per_key(keys, "lower"),
-                    upper=self._per_key(keys, "upper"),
+                    lower=self._per_key(keys, "lower") * room,
+                    upper=self._per_key(keys, "upper") * room,
                     log_prior=np.array([problem.terms[index].log_prior for index, _ in keys]),
                 ))  # fmt: skip
         return self._short_scans
@@ -424,6 +427,12 @@ class WhitenedRegression:
     def _per_key(self, keys: Sequence[tuple[int, Frozen]], name: str) -> FloatArray:
         terms = self.problem.terms
         return np.array([[getattr(terms[t].parameters[i], name) for i in terms[t].base_indices()] for t, _ in keys])
+
+    def _room(self, term: int) -> float:
+        """Factor on the bounds of a term's sizes: of what is not in proportion to its size a first order says only so much."""
+        point = self.problem.point
+        there = point is not None and any(size.term == term for size in point.sizes)
+        return CURVED_ROOM if self.problem.terms[term].is_curved and not there else 1.0
 
     def scan(
         self,
@@ -483,8 +492,9 @@ class WhitenedRegression:
             right = self.target[:, None] if targets is None else targets
             moment = (flat_columns.T @ right.astype(np.float32)).astype(float)
             parameters = [term.parameters[i] for i in term.base_indices()]
-            bounds = [np.array([[getattr(p, name) for p in parameters]]) for name in ("deviation", "lower", "upper")]
-            gains = _gains_within(gram, cross, moment, projected, *bounds) + term.log_prior
+            deviation = np.array([[p.deviation for p in parameters]])
+            lower, upper = (self._room(index) * np.array([[getattr(p, n) for p in parameters]]) for n in ("lower", "upper"))
+            gains = _gains_within(gram, cross, moment, projected, deviation, lower, upper) + term.log_prior
             self._collect([(index, tuple(sorted(shape.items()))) for shape in term.shapes], gains, results)
         if targets is None:
             results[0].sort(key=lambda candidate: -candidate.gain)
@@ -519,8 +529,8 @@ class WhitenedRegression:
         """Whether all parameters of an instance lie within their bounds, per instance."""
         position, within = self.nuisance.shape[1], []
         for instance in fit.instances:
-            parameters = self.problem.terms[instance.term].parameters
-            means = fit.mean[position : position + len(instance.active)]
+            parameters, room = self.problem.terms[instance.term].parameters, self._room(instance.term)
+            means = fit.mean[position : position + len(instance.active)] / room
             within.append(
                 all(parameters[k].lower <= mean <= parameters[k].upper for k, mean in zip(instance.active, means, strict=True))
             )

@@ -17,7 +17,12 @@ import math
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import scrub_torque, slip_under_load, tyre_step
+from pcw_description.contact.contact_model import (
+    scrub_torque,
+    slip_under_load,
+    tyre_step,
+    tyre_step_with_slopes,
+)
 from pcw_description.effects.kinds import (
     CONTACT_RESULTS,
     FORCE_INPUTS,
@@ -29,6 +34,7 @@ from pcw_description.effects.kinds import (
     RADIUS_CHANGE,
     RADIUS_SLOPE,
 )
+from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .caster_arrays import (
     BX,
@@ -99,12 +105,42 @@ def _joint_inertia(caster, along):  # type: ignore[no-untyped-def]
     return caster[I_ROLL] if along == 0 else caster[IZZ] + caster[J_PP]
 
 
+def contact_mobility(robot: RobotDescription) -> FloatArray:
+    """Return by how much a force along and across each wheel accelerates its slip at most, (n, 2) [1/kg].
+
+    The wheel and fork by themselves, and the chassis as if all wheels pushed its nearest part at once.
+    """
+    chassis = robot.chassis
+    inertia_x, inertia_y, inertia_z = chassis.principal_inertias()
+    reach = float(np.max(np.linalg.norm(robot.steer_axis - np.array(chassis.com[:2]), axis=1)))
+    reach += float(np.max(np.linalg.norm(robot.caster_offset, axis=1)))
+    base = 1.0 / chassis.mass + chassis.com[2] ** 2 / min(inertia_x, inertia_y) + reach**2 / inertia_z
+    mobility = np.empty((robot.n, 2))
+    for i, (caster, armature) in enumerate(zip(robot.casters, robot.armature, strict=True)):
+        inertia = armature + np.diag([caster.wheel.inertia_axle, caster.module.inertia_zz])
+        arms = np.array([[caster.wheel_radius, caster.caster_offset[1]], [0.0, -caster.caster_offset[0]]])
+        mobility[i] = np.diag(arms @ np.linalg.solve(inertia, arms.T)) + robot.n * base
+    return mobility
+
+
+@compiled
+def _slip_after(dt, mobility, slip, slip_before, force, force_before, stiffness):  # type: ignore[no-untyped-def]
+    """Slip at the end of a step, in which a stiff tyre under a light wheel has turned back long before its end.
+
+    All that pushes besides the tyre is taken to go on as in the last step, and the tyre to follow its slip to first order. A
+    mobility that is too large damps; one that is too small would let the step swing up.
+    """
+    change = slip - slip_before + dt * mobility * (force_before - force)
+    return slip + change / (1.0 + dt * mobility * stiffness)
+
+
 @compiled
 def contact_wrench(  # type: ignore[no-untyped-def]
     dt,
     time,
     chassis_mass,
     casters,
+    mobility,
     suspension,
     body_rotors,
     effects,
@@ -124,6 +160,7 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         time: since the start [s].
         chassis_mass: of the base link [kg].
         casters: constant numbers (n, TYRE + TYRE_SIZE).
+        mobility: what a force along and across each wheel does at least to its slip (n, 2) [1/kg]; see `contact_mobility`.
         suspension: vertical stiffness [N/m] and damping [N s/m] of one wheel.
         body_rotors: reflected rotors that the engine carries in fork and wheel, not on the joints (n, 2, 2) [kg m^2].
         effects: see `EffectTables`.
@@ -191,12 +228,14 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         )
         tyre = casters[i, TYRE:]
         grip = normal * ground[FRICTION]
+        z_x, z_y = slip_under_load(row[ZX], row[FZ], normal), slip_under_load(row[ZY], row[FZ], normal)
+        _, _, force_x, force_y, _, _, stiff_x, stiff_y = tyre_step_with_slopes(tyre, z_x, z_y, slip_x, slip_y, speed, grip, dt)
         row[ZX], row[ZY], force_x, force_y = tyre_step(
             tyre,
-            slip_under_load(row[ZX], row[FZ], normal),
-            slip_under_load(row[ZY], row[FZ], normal),
-            slip_x,
-            slip_y,
+            z_x,
+            z_y,
+            _slip_after(dt, mobility[i, 0], slip_x, row[SLIP_X], force_x, row[FX], stiff_x),
+            _slip_after(dt, mobility[i, 1], slip_y, row[SLIP_Y], force_y, row[FY], stiff_y),
             speed,
             grip,
             dt,

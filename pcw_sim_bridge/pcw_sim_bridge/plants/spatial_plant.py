@@ -35,7 +35,7 @@ from .caster_arrays import (
 )
 from .effect_tables import EffectTables
 from .plant import PlantError, PlantState
-from .spatial_contact import contact_wrench, rotation_matrix
+from .spatial_contact import contact_mobility, contact_wrench, rotation_matrix
 from .true_robot import as_it_really_is, without_geared_rotors
 
 # Time for the robot to sink into its springs after a reset [s].
@@ -165,6 +165,7 @@ class SpatialPlant:
         bodies = without_geared_rotors(true_robot)
         self._effects = EffectTables(true_robot, dt)
         self._casters = caster_numbers(bodies)
+        self._mobility = contact_mobility(bodies)
         suspension = true_robot.wheel_suspension
         self._suspension = np.array([suspension.stiffness, suspension.damping])
         self._chassis_mass = bodies.chassis.mass
@@ -251,6 +252,7 @@ class SpatialPlant:
             self._steps * self.dt,
             self._chassis_mass,
             self._casters,
+            self._mobility,
             self._suspension,
             self._engine.body_rotors,
             self._effects.compiled,
