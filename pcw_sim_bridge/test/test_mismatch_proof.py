@@ -16,12 +16,12 @@ from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.all_cores import on_all_cores
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.explanation import NamedTerm
+from pcw_sim_bridge.mismatch.explanation import NamedTerm, explain
 from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
 from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
-from pcw_sim_bridge.mismatch.proof import moves_the_robot
+from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot
 from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -165,17 +165,23 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
     assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
 
 
-def test_numbers_that_no_description_holds_are_in_the_patch_as_effects(tmp_path: Path) -> None:
-    """A floor, a torque constant and a wheel's zero, each as a recording re-tunes it: simulated, the error is a tenth."""
+@pytest.fixture(scope="module")
+def deviating(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive of a healthy robot on a floor that slopes, with a torque constant and a wheel's zero that are a little off."""
     off = {"ground.slope.x": 3e-3, "ground.slope.y": -2e-3, "steer_zero/rear_right": 4e-3}
     off["torque_constant/rear_left_drive"] = 0.02
-    path = tmp_path / "run"
+    path = tmp_path_factory.mktemp("deviating") / "run"
     record_run(
-        with_deviations(THESIS, off), lambda t: min(t, 1.0) * np.array([0.4 * np.sin(t), 0.3, 0.3 * np.cos(t)]), 8.0, 2, path,
+        with_deviations(THESIS, off), lambda t: min(t, 1.0) * np.array([0.4 * np.sin(t), 0.3, 0.3 * np.cos(t)]), 10.0, 2, path,
         controlled_as=THESIS,
     )  # fmt: skip
+    return path
+
+
+def test_numbers_that_no_description_holds_are_in_the_patch_as_effects(deviating: Path) -> None:
+    """Simulated with all numbers as a recording re-tunes them, the error is a tenth."""
     nominal = RobotSubject(THESIS)
-    opened = [nominal.open(path, "fit", {})]
+    opened = [nominal.open(deviating, "fit", {})]
     problem = nominal.problem(opened)
     search = EffectSearch(problem, np.random.default_rng(0))
     fit = search.whiten_at(search.residual_of(())).fit(())
@@ -187,6 +193,25 @@ def test_numbers_that_no_description_holds_are_in_the_patch_as_effects(tmp_path:
         for subject in (nominal, nominal.patched([], retuned))
     )
     assert after < 0.1 * before
+
+
+@pytest.mark.parametrize("besides", [False, True])
+def test_what_is_retuned_beside_effects_of_other_channels_is_proved(deviating: Path, besides: bool) -> None:
+    """A healthy robot is left as it is described; where something else makes a patch, re-tuned numbers are in it and help."""
+    nominal = RobotSubject(THESIS)
+    opened = [nominal.open(deviating, "fit", {})]
+    explanation = explain(nominal.problem(opened), np.random.default_rng(0))
+    assert not explanation.named
+    prover = Prover(
+        nominal, opened, [], lambda e: {n.name: 0.0 for n in e.search.problem.nuisances}, lambda e, _: e,
+        np.random.default_rng(0), besides,
+    )  # fmt: skip
+    finding = prover.prove(explanation).finding
+    assert finding.rollout_gap_closed is not None
+    if besides:
+        assert min(finding.gap_closed, finding.rollout_gap_closed) > 0.8
+    else:
+        assert finding.gap_closed == finding.rollout_gap_closed == 0.0
 
 
 # -- manoeuvres, intervals, places ------------------------------------------------------------------------------------

@@ -107,7 +107,8 @@ def analyse(
     commands = command_findings(
         subject.command_problems(opened), subject.command_problems(held_out), seed, settings, progress
     )
-    prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
+    generator = np.random.default_rng(seed)
+    prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, generator, bool(commands.named))
     proof = prover.prove(explanation)
     explanation = proof.explanation
     problem = explanation.search.problem

@@ -32,6 +32,7 @@ LEAST_PROBABILITY = 0.01  # of a name: below it stands for another one
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
 LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to speak against an effect
+TELLING_PART = 0.1  # of the description's error in a simulation; below it no effect is told from numbers that were re-tuned
 LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
@@ -88,6 +89,7 @@ class Prover:
         retune: Retune,
         reduce: Reduce,
         rng: np.random.Generator,
+        besides: bool = False,
     ) -> None:
         """Open the held-out data.
 
@@ -98,7 +100,9 @@ class Prover:
             retune: explanation -> numbers of the description that go into the patch.
             reduce: explanation, effects that stay -> the explanation by these alone.
             rng: of bootstrap and noise.
+            besides: other effects are found by other channels, so that there is a patch in any case.
         """
+        self.besides = besides
         self.subject, self.retune, self.reduce, self.rng = subject, retune, reduce, rng
         self.other = subject.problem(held_out) if held_out else None
         self.unusable = self.other is not None and self.other.valid.any(axis=1).sum() < LEAST_DURATION * self.other.rate
@@ -135,7 +139,7 @@ class Prover:
             kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
             explanation = self.reduce(explanation, kept)
         predicted = held_out.problem.residual - held_out.problem.nominal_residual
-        if explanation.named:
+        if explanation.named or self.besides:
             means = held_out.means()
             bare = means.copy()
             bare[:, : held_out.nuisances] = 0.0
@@ -236,7 +240,9 @@ class Prover:
                 continue
             before, with_it = (np.where(away[:, None, None], np.nan, squares) for squares in (without, after))
             errors = _rollout_errors(windows, before, with_it, self.rng, [MAIN_HORIZON]).pooled()
-            harms.append((float(errors.worse()[0]), index))
+            nominal = np.where(away[:, None, None], np.nan, self.before)
+            described = _rollout_errors(windows, nominal, nominal, self.rng, [MAIN_HORIZON]).pooled()
+            harms.append((float(errors.worse(TELLING_PART**2 * described.before)[0]), index))
         worst, index = max(harms, default=(0.0, 0))
         return (index, "the simulation follows less well with it") if worst > 0.0 else None
 
@@ -244,7 +250,7 @@ class Prover:
         """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""
         if self.windows is None or self.before is None:
             return None
-        if not held_out.proposed:
+        if not (held_out.proposed or self.besides):
             return self.before
         fold = _fold_of(held_out, self.windows)
         after = np.full_like(self.before, np.nan)
@@ -362,7 +368,8 @@ class Prover:
             return (), None
         retuned = self._numbers(explanation)
         model = self._patched(explanation.search.problem, held_out, held_out.means().mean(axis=0), retuned, None)
-        noise = windows.relative((model if held_out.proposed else self.subject).rollout_floor(windows, self.rng))
+        right = model if held_out.proposed or self.besides else self.subject
+        noise = windows.relative(right.rollout_floor(windows, self.rng))
         counts = np.maximum(np.isfinite(noise).sum(axis=0), 1)
         floors = np.nansum(noise, axis=0) / counts
         found, gap = [], None
