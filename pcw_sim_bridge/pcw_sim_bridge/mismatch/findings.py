@@ -182,7 +182,8 @@ class FitFinding:
         gap_closed: (before - after) / (before - floor) of `inverse_nrmse`, the floor being noise; 0 where there is no gap.
         gap_closed_ci95, inverse_ci95: 95 % intervals, the latter before and after; inverse_floor: what noise leaves.
         channels: errors by channel; rollouts: by signal and horizon.
-        rollout_gap_closed: likewise of the simulation over half a second, all signals; None where nothing was simulated.
+        rollout_gap_closed: likewise of the simulation over half a second, all signals; None where nothing was simulated, or
+            where nothing but noise is left before.
         harm: the largest relative growth of the error of a channel, signal or recording that is no chance; where, in
             `harm_at`.
     """

@@ -19,6 +19,7 @@ import numpy as np
 
 from .evidence_selection import EffectSearch, Selection
 from .noise_model import huber_weights, robust_deviation
+from .place_waves import place_waves
 from .regression_problem import FloatArray, RegressionProblem
 from .unknown_law import Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
@@ -138,7 +139,7 @@ class LawSearch:
     def _screened(self) -> list[Law]:
         """The most promising laws: on top of the names, and with none."""
         assert self.problem.sites is not None
-        laws = hypotheses(self.problem.sites)
+        laws = [*hypotheses(self.problem.sites), *place_waves(self.problem, self.search.residual_of(self.names))]
         chosen: list[Law] = []
         for gains in _Screen(self.search, laws).gains(list(dict.fromkeys([self.names, ()]))):
             order = np.argsort(-gains)
@@ -240,6 +241,8 @@ class LawSearch:
             enough = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
             if own > 0.0:
                 enough = min(enough, max(REPLACED_PART * own, problem.scale_deviation * signal))
+            if problem.misjudged is not None:
+                enough = max(enough, float(np.sqrt(np.mean(problem.misjudged[valid, channel] ** 2))))
             if size > max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), enough):
                 return True
         return False

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from .regression_problem import FloatArray, IntArray
+from .regression_problem import BoolArray, FloatArray, IntArray
 
 Pair = tuple[float, float]
 
@@ -72,10 +72,18 @@ class PairedErrors:
         found = np.zeros(len(self.before))
         least = np.full(len(self.before), 1e-300) if floors is None else floors
         for k in self.judged:
-            change = self.after_draws[:, k] - self.before_draws[:, k]
-            if np.quantile(change[np.isfinite(change)], 0.025) > 0.0 and self.after[k] > self.before[k]:
+            if self._change(k, 0.025) > 0.0 and self.after[k] > self.before[k]:
                 found[k] = max(np.sqrt(self.after[k] / max(self.before[k], least[k])) - 1.0, 0.0)
         return found
+
+    def better(self) -> BoolArray:
+        """Whether the error has fallen (K,), and not by chance (97.5 %)."""
+        return np.array([k in self.judged and self._change(k, 0.975) < 0.0 for k in range(len(self.before))])
+
+    def _change(self, k: int, quantile: float) -> float:
+        """A quantile of how far the squared error of quantity k has grown."""
+        change = self.after_draws[:, k] - self.before_draws[:, k]
+        return float(np.quantile(change[np.isfinite(change)], quantile))
 
 
 def _mean(values: FloatArray, share: FloatArray) -> FloatArray:

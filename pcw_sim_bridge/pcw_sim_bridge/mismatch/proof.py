@@ -382,7 +382,11 @@ class Prover:
                 worse[f"{signal} after {horizon:g} s"] = float(grown[k])
             if h == MAIN_HORIZON and len(errors.judged):
                 pooled, floor = errors.pooled(), float(np.sqrt(np.mean(floors[h, errors.judged])))
-                gap = float(gap_closed(np.sqrt(pooled.before), np.sqrt(pooled.after), floor)[0])
+                first, last = float(np.sqrt(pooled.before[0])), float(np.sqrt(pooled.after[0]))
+                if pooled.better()[0]:
+                    # Shaking that is real looks like noise of the sensors: no noise does more than a patch leaves.
+                    floor = min(floor, last)
+                gap = float(gap_closed(np.array(first), np.array(last), floor)) if first > floor else None
         return tuple(found), gap
 
 
