@@ -146,7 +146,12 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
     for before, after in (fit["inverse_nrmse"], *fit["rollout"].values()):
         assert after < 0.5 * before
     patched = parse_robot(load_yaml_mapping(out / "robot_patched.yaml"))
-    assert [instance.target for instance in patched.physics] == [(caster,)]
+    named, *small = patched.physics
+    assert (named.name, named.target) == ("drive_coulomb_friction", (caster,))
+    # What the description has no place for, and no more than a healthy robot's.
+    largest = {"steer_zero_offset": 6e-3, "torque_constant_error": 0.03, "ground_slope": 6e-3}
+    sizes = {"steer_zero_offset": "offset", "torque_constant_error": "error", "ground_slope": "angle"}
+    assert all(abs(instance.parameters[sizes[instance.name]]) < largest[instance.name] for instance in small)
     lines = done.stdout.splitlines()
     assert lines[0] == str(out / "report.html")
     assert len(lines) == 6

@@ -141,9 +141,9 @@ class RobotSubject:
         return get(instance.name).statement(instance.target, instance.parameters, instance.axis)
 
     def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> RobotSubject:
-        """Return the robot with effects added and its numbers re-tuned; those of its readings have no place in it."""
-        robot = retuned_robot(self.robot, retuned)
-        subject = RobotSubject(dataclasses.replace(robot, physics=(*robot.physics, *effects)))
+        """Return the robot with effects added and its numbers re-tuned; see `retuned_robot`."""
+        robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
+        subject = RobotSubject(retuned_robot(robot, retuned))
         subject._cutoff = self._cutoff
         return subject
 
