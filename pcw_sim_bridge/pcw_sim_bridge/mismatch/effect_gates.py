@@ -13,8 +13,9 @@ from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
 # What happens once must explain so many times what is left anywhere: models err in bursts, and some shape fits one of them.
 ABOVE_BURSTS = 3.0
-# By so much more must effects stand out whose columns hold noise that the residual holds.
-NOISY_FACTOR = 3.0
+# By so much more must effects stand out whose columns hold noise that the residual holds; and by so much more again where they
+# are on all casters alike: what gears that wind up do to all wheels at once, a chassis that pitches on its springs does, too.
+NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
 
 
 class EffectGates:
@@ -136,7 +137,7 @@ class EffectGates:
         seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * remains, part), 1e-300)))
         if share >= 1.0 or seen < 1.0 or self.problem.drifts is None:
             return share
-        wanted = self.settings.least_peculiar * (NOISY_FACTOR if self._are_noisy(instances) else 1.0)
+        wanted = self.settings.least_peculiar * self._noise_factor(instances)
         return max(share, min(seen, regression.peculiar(change) / wanted))
 
     def _least(self, instance: Instance) -> float:
@@ -149,16 +150,20 @@ class EffectGates:
     def _details(self, instances: Sequence[Instance]) -> FloatArray:
         """What the model itself misjudges (C,), which is no effect: two deviations of its scale, and its slips.
 
-        What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that thrice.
+        What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that several times.
         """
         scale = 2.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
         if self.problem.misjudged is None:
             return scale
-        return np.maximum(scale, (NOISY_FACTOR if self._are_noisy(instances) else 1.0) * self._sizes(self.problem.misjudged))
+        return np.maximum(scale, self._noise_factor(instances) * self._sizes(self.problem.misjudged))
 
-    def _are_noisy(self, instances: Sequence[Instance]) -> bool:
-        """Whether some columns hold noise that the residual holds."""
-        return any(self.problem.terms[instance.term].noisy for instance in instances)
+    def _noise_factor(self, instances: Sequence[Instance]) -> float:
+        """By how much more some instances must stand out because their columns hold noise that the residual holds."""
+        noisy = [self.problem.terms[instance.term] for instance in instances if self.problem.terms[instance.term].noisy]
+        if not noisy:
+            return 1.0
+        all_casters = max(len(term.target) for term in self.problem.terms)
+        return NOISY_FACTOR * (COMMON_FACTOR if any(len(term.target) == all_casters > 1 for term in noisy) else 1.0)
 
 
 def _at_work(part: FloatArray) -> BoolArray:
