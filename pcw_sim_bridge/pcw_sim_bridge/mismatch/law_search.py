@@ -232,6 +232,7 @@ class LawSearch:
             columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
             replaced += drop * (columns @ without.mean[position : position + len(instance.active)])
             position += len(instance.active)
+        guessed = False
         for channel in range(change.shape[1]):
             valid = problem.valid[:, channel]
             if not valid.any():
@@ -241,11 +242,13 @@ class LawSearch:
             enough = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
             if own > 0.0:
                 enough = min(enough, max(REPLACED_PART * own, problem.scale_deviation * signal))
-            if problem.misjudged is not None:
-                enough = max(enough, float(np.sqrt(np.mean(problem.misjudged[valid, channel] ** 2))))
-            if size > max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), enough):
+            if size <= max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), enough):
+                continue
+            if problem.misjudged is None or size > float(np.sqrt(np.mean(problem.misjudged[valid, channel] ** 2))):
                 return True
-        return False
+            guessed = True
+        # Slips are the model's guess, unless they do what no slow error of its torques and tyres does.
+        return guessed and self.search.whiten_at(left).peculiar(change) > self.search.settings.least_peculiar
 
 
 def _same_place(law: Law, target: Sequence[str]) -> bool:
