@@ -139,13 +139,13 @@ class Prover:
             kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
             explanation = self.reduce(explanation, kept)
         predicted = held_out.problem.residual - held_out.problem.nominal_residual
-        if explanation.named or self.besides:
+        if self._is_patched(explanation):
             means = held_out.means()
             bare = means.copy()
             bare[:, : held_out.nuisances] = 0.0
             predictions = [held_out.predicted(numbers) for numbers in (means, bare)]
             errors = [self._error(explanation, held_out, prediction) for prediction in predictions]
-            self.tuned = errors[0] <= errors[1]
+            self.tuned = errors[0] <= errors[1] and not self._simulates_worse(explanation, after)
             predicted = predictions[0 if self.tuned else 1]
             if not self.tuned:
                 after = self._rollout(explanation, held_out)
@@ -155,6 +155,18 @@ class Prover:
         notes += self._remarks(explanation, held_out, after)
         finding = self._finding(explanation, held_out, predicted, after)
         return Proof(explanation, finding, held_out, predicted, self.tuned, tuple(dropped), tuple(notes))
+
+    def _simulates_worse(self, explanation: Explanation, after: FloatArray | None) -> bool:
+        """Whether the patched description is followed less well than the nominal one, all signals together."""
+        windows = self._quiet_windows(explanation)
+        if windows is None or self.before is None or after is None:
+            return False
+        errors = _rollout_errors(windows, self.before, after, self.rng, [MAIN_HORIZON]).pooled()
+        return bool(len(errors.judged)) and float(errors.worse()[0]) > 0.0
+
+    def _is_patched(self, explanation: Explanation) -> bool:
+        """Whether there is anything beside which numbers of the description are re-tuned."""
+        return bool(explanation.named) or self.besides
 
     def _numbers(self, explanation: Explanation) -> Mapping[str, float]:
         """Numbers of the description that go into the patch."""
@@ -250,7 +262,7 @@ class Prover:
         """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""
         if self.windows is None or self.before is None:
             return None
-        if not (held_out.proposed or self.besides):
+        if not self._is_patched(explanation):
             return self.before
         fold = _fold_of(held_out, self.windows)
         after = np.full_like(self.before, np.nan)
@@ -368,7 +380,7 @@ class Prover:
             return (), None
         retuned = self._numbers(explanation)
         model = self._patched(explanation.search.problem, held_out, held_out.means().mean(axis=0), retuned, None)
-        right = model if held_out.proposed or self.besides else self.subject
+        right = model if self._is_patched(explanation) else self.subject
         noise = windows.relative(right.rollout_floor(windows, self.rng))
         counts = np.maximum(np.isfinite(noise).sum(axis=0), 1)
         floors = np.nansum(noise, axis=0) / counts
