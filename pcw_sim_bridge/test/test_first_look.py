@@ -12,10 +12,13 @@ from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import analyse
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.first_look import Looked, orders, patches, waves, windows
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.shape_search import shape_interval
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
@@ -95,6 +98,27 @@ def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object
     else:
         assert np.hypot(values["x"] - 0.5, values["y"] - 0.3) < 0.15
         assert values["factor"] == pytest.approx(0.3, rel=0.2)
+
+
+def test_a_push_that_ends_while_nothing_can_be_judged_may_end_at_any_time_of_that(tmp_path: Path) -> None:
+    """The robot stands from 7 to 10 s, and the push ends at 9 s: the interval of its duration holds all that time."""
+
+    def twist(time: float) -> np.ndarray:
+        moving = np.clip(7.0 - time, 0.0, 1.0) + np.clip(time - 10.0, 0.0, 1.0)
+        return moving * np.array([0.4 * np.sin(1.3 * time), 0.4 * np.cos(0.9 * time), 0.6 * np.sin(0.7 * time)])
+
+    push = {"name": "external_push", "target": ["chassis"], "force_x": 20.0, "force_y": 10.0, "start": 5.0, "duration": 4.0}
+    true = dataclasses.replace(THESIS, physics=read_physics([push], THESIS.caster_names))
+    record_run(true, twist, 16.0, 5, tmp_path / "run", "reduced", controlled_as=THESIS)
+    problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / "run", THESIS)]).build()
+    number = next(k for k, term in enumerate(problem.terms) if term.effect == "external_push")
+    term = problem.terms[number]
+    instance = Instance(number, tuple(sorted({**term.shapes[0], "start": 5.0, "duration": 2.2}.items())), term.base_indices())
+    search = EffectSearch(problem, np.random.default_rng(0))
+    regression = search.whiten_at(search.residual_of((instance,)))
+    low, high = shape_interval(regression, (), instance, "duration")
+    assert low < 2.3
+    assert 4.0 < high < 5.5
 
 
 def test_a_problem_is_exact_where_it_is_made_so(tmp_path: Path) -> None:

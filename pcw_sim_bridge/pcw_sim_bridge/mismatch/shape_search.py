@@ -22,6 +22,7 @@ from .whitened_regression import Instance, WhitenedRegression
 DROP = 1.92
 # Widest interval of a parameter on a logarithmic scale, as a ratio to either side.
 WIDEST_RATIO = 30.0
+UNSEEN_STEPS = 200.0  # to either side of what happens once, on a linear scale
 COARSE = 7  # points between the neighbours on the grid
 SWEEPS = 3  # over all parameters, as long as one gains
 WORTH = 0.1  # nats; a further point that promises less is not asked for
@@ -59,7 +60,9 @@ def shape_interval(
     if not kind or (kind == "log" and centre <= 0.0):
         return centre, centre
     place = _Place(ShapeTrials(regression, others, instance), instance, name, kind)
-    widest = math.log(WIDEST_RATIO) if kind == "log" else 2.0 * spacing
+    # What happened once may have ended, or its patch, anywhere in a time or on a floor from which nothing can be judged.
+    steps = UNSEEN_STEPS if regression.problem.terms[instance.term].once else 2.0
+    widest = math.log(WIDEST_RATIO) if kind == "log" else steps * spacing
     best, drop = place.evidence(0.0), DROP * widening
 
     def end(direction: float) -> float:
