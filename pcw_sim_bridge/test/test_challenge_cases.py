@@ -37,6 +37,7 @@ from pcw_sim_bridge.mismatch.challenge.healthy_deviations import (
     draw_deviations,
     effect_instance,
     healthy_numbers,
+    tolerated_cost,
     with_deviations,
 )
 from pcw_sim_bridge.mismatch.challenge.outside_effects import OUTSIDE_EFFECTS, CrossJointLaw
@@ -198,6 +199,32 @@ def test_what_is_within_tolerance_has_hardly_any_evidence(channels: HealthyChann
     assert found[1].evidence > 18.0
 
 
+@pytest.mark.parametrize(
+    ("name", "target", "parameters", "numbers"),
+    [
+        ("wheel_radius_error", ("front_left", "rear_left"), {"error": "wheel_radius/front_left"}, 2),
+        ("torque_constant_error", ("rear_left",), {"error": "torque_constant/rear_left_drive"}, 1),
+        ("payload_offset", ("chassis",), {"x": "chassis.com.x", "y": "chassis.com.y"}, 2),
+        ("imu_scale", ("imu",), {"gyro": "imu.gyro_scale"}, 1),
+    ],
+)
+def test_what_a_healthy_robot_may_differ_by_costs_what_its_tolerances_say(
+    name: str, target: tuple[str, ...], parameters: dict[str, str], numbers: int
+) -> None:
+    deviations = {number.name: number.deviation for number in healthy_numbers(THESIS)}
+    for times in (1.0, -8.0):
+        effect = effect_instance(name, target, {key: times * deviations[moved] for key, moved in parameters.items()})
+        assert tolerated_cost(THESIS, effect) == pytest.approx(0.5 * numbers * times**2)
+
+
+def test_what_no_healthy_robot_has_costs_more_than_any_tolerance() -> None:
+    assert tolerated_cost(THESIS, effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": 1e-4})) == np.inf
+    assert tolerated_cost(THESIS, effect_instance("payload_offset", ("chassis",), {"x": 1e-4, "y": 0.0, "z": 0.1})) == np.inf
+    angle = 2.0 * THESIS.tolerance("ground.slope").value
+    slope = effect_instance("ground_slope", ("chassis",), {"angle": angle, "direction": 2.0})
+    assert tolerated_cost(THESIS, slope) == pytest.approx(2.0)
+
+
 def test_what_moves_the_robot_otherwise_has_no_more_evidence_than_its_tolerances_cost() -> None:
     """All steering zeros 2.85 deviations off drive another way: what differs on the way is no evidence of anything."""
     robot = load_robot("tidybot2")
@@ -268,5 +295,7 @@ def test_masked_cases_are_masked(masking: str) -> None:
         assert own.controller == "velocity_loops"
     elif masking == "cancelling":
         assert len(effects_of(answer)) == 2
+        costs = [tolerated_cost(own.nominal, effect) for effect in effects_of(answer)]
+        assert all(effect["evidence"] <= min(costs) for effect in answer["effects"])
     else:
         assert len([run for run in runs if run.path.startswith("recordings")]) == 2

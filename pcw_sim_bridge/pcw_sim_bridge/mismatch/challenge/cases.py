@@ -35,7 +35,13 @@ from .concealed_effects import (
     first_on_patch,
 )
 from .effect_size import EffectSize, HealthyChannels
-from .healthy_deviations import draw_deviations, effect_instance, healthy_numbers, with_deviations
+from .healthy_deviations import (
+    draw_deviations,
+    effect_instance,
+    healthy_numbers,
+    tolerated_cost,
+    with_deviations,
+)
 from .outside_effects import OUTSIDE_EFFECTS
 from .random_robots import draw_robot
 from .simulated_case import Run, SimulatedRecording, World, simulate
@@ -51,7 +57,8 @@ SHORTEST_RUN, LONGEST_RUN = 15.0, 600.0  # [s]
 HOLDOUT_SHARE = 0.7  # the held-out recording may be shorter: it only tests
 # The detection floor of the proof: a change of some channel by so many times its noise floor ...
 LEAST_SIZE = 3.0
-# ... and larger than a healthy robot explains: re-tuning it away takes 6 standard deviations of the tolerances at least.
+# ... and larger than a healthy robot explains: re-tuning it away takes 6 standard deviations of the tolerances at least, each
+# effect by itself, of two that cancel too.
 LEAST_EVIDENCE = 18.0  # [nats]
 # Magnitudes are drawn log-uniform; one that turns out below the floor, or above the largest strength, is scaled to a strength
 # drawn log-uniform between these, in multiples of the floor.
@@ -267,7 +274,7 @@ class _Drawing:
             if self._order.masking == "retuned":
                 self._retune(size, channels)
                 left = channels.evidence(self._world.nominal, [simulate(self._world.quiet(), run, instances)])
-                size = dataclasses.replace(size, evidence=left)
+                size = self._not_tolerated(dataclasses.replace(size, evidence=left), instances)
             found += [self._entry(instance, size, healthy) for instance in instances]
         return found
 
@@ -300,7 +307,7 @@ class _Drawing:
                 instances = group(factor)
                 if kept is not None and instances == kept[0]:
                     break  # at its limit
-                size = channels.size([simulate(self._world.quiet(), run, instances)])
+                size = self._not_tolerated(channels.size([simulate(self._world.quiet(), run, instances)]), instances)
             except PcwError:  # too much for the robot, or for the effect's own range
                 factor *= 0.3
                 continue
@@ -311,6 +318,14 @@ class _Drawing:
         if kept is None:
             raise MismatchError(f"{self._order.name}: {self._order.effects} at no size that the robot can be driven with")
         return kept
+
+    def _not_tolerated(self, size: EffectSize, instances: Sequence[EffectInstance]) -> EffectSize:
+        """Return the size with no more evidence than each effect has against a healthy robot that differs by just that.
+
+        What one run costs more than another is also that a robot which slips goes another way.
+        """
+        tolerated = min(tolerated_cost(self._base, instance) for instance in instances)
+        return dataclasses.replace(size, evidence=min(size.evidence, tolerated))
 
     def _retune(self, size: EffectSize, channels: HealthyChannels) -> None:
         """Move the numbers of the description to where they hide the effect best; the controller believes them too."""

@@ -25,6 +25,28 @@ LARGEST_TYRE_DEVIATION = 1.4
 # No tyre gives less than this part of what is described, however it is drawn or tuned.
 STIFFEST = 0.2
 RELAXATION = "contact.relaxation_length"
+# Effects that move healthy numbers and nothing else: which number each of their parameters moves.
+MOVED: Mapping[str, Mapping[str, str]] = {
+    "wheel_radius_error": {"error": "wheel_radius/{caster}"},
+    "caster_offset_error": {"x": "caster_offset.x/{caster}", "y": "caster_offset.y/{caster}"},
+    "steer_zero_offset": {"offset": "steer_zero/{caster}"},
+    "torque_constant_error": {"error": "torque_constant/{caster}_{axis}"},
+    "payload_offset": {"x": "chassis.com.x", "y": "chassis.com.y"},
+    "ground_slope": {"angle": "ground.slope.x"},  # whichever its direction: the tolerance is that of y
+    "imu_lever_arm": {"x": "imu.position.x", "y": "imu.position.y"},
+    "imu_bias": {
+        "gyro": "imu.gyro_bias",
+        "accelerometer_x": "imu.accelerometer_bias.x",
+        "accelerometer_y": "imu.accelerometer_bias.y",
+    },
+    "imu_scale": {
+        "gyro": "imu.gyro_scale",
+        "accelerometer_x": "imu.accelerometer_scale.x",
+        "accelerometer_y": "imu.accelerometer_scale.y",
+    },
+    "clock_offset": {"offset": "clock.offset.imu", "tracker_offset": "clock.offset.tracker"},
+}
+NO_NUMBERS = ("direction",)  # parameters that say which way, not how much
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +100,25 @@ def with_deviations(robot: RobotDescription, deviations: Mapping[str, float]) ->
         if deviation != 0.0:
             robot = numbers[name].change(robot, deviation)
     return robot
+
+
+def tolerated_cost(robot: RobotDescription, instance: EffectInstance) -> float:
+    """Return what an effect costs as deviations within tolerances, 1/2 sum (value / deviation)^2 [nats].
+
+    Infinite where an effect is more than numbers that a healthy robot may differ in.
+    """
+    deviations = {number.name: number.deviation for number in healthy_numbers(robot)}
+    effect, moved = get(instance.name), MOVED.get(instance.name, {})
+    axis = instance.axis or effect.axis
+    cost = 0.0
+    for parameter, value in instance.parameters.items():
+        if value == 0.0 or parameter in NO_NUMBERS:
+            continue
+        if parameter not in moved:
+            return math.inf
+        names = {moved[parameter].format(caster=name, axis=axis) for name in instance.target}
+        cost += sum(0.5 * (value / deviations[name]) ** 2 for name in names)
+    return cost
 
 
 def effect_instance(
