@@ -218,6 +218,7 @@ def test_what_a_healthy_robot_may_differ_by_costs_what_its_tolerances_say(
 
 
 def test_what_no_healthy_robot_has_costs_more_than_any_tolerance() -> None:
+    assert tolerated_cost(THESIS, EffectInstance("fading_torque", THESIS.caster_names, {"size": 1e-4})) == np.inf
     assert tolerated_cost(THESIS, effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": 1e-4})) == np.inf
     assert tolerated_cost(THESIS, effect_instance("payload_offset", ("chassis",), {"x": 1e-4, "y": 0.0, "z": 0.1})) == np.inf
     angle = 2.0 * THESIS.tolerance("ground.slope").value

@@ -121,6 +121,29 @@ def test_one_effect_told_caster_by_caster_is_one_effect() -> None:
     assert judged(both, parts).parameter_errors() == []
 
 
+def test_what_both_axes_say_in_place_of_one_thing_is_a_look_alike_of_it() -> None:
+    """Torques that are all wrong by one factor, at the drives and at the steerings, stand for a mass."""
+    payload = answer("single", concealed("payload_mass", "chassis", parameters={"mass": 9.0}))
+    casters = "front_left+front_right"
+    sides = [named("torque_constant_error", casters, ambiguous_with=["payload_mass"], probability=0.5) for _ in range(2)]
+    assert judged(payload, report(*sides)).outcome == "in a look-alike set"
+    alone = [named("torque_constant_error", casters) for _ in range(2)]
+    assert judged(payload, report(*alone)).outcome == "wrong name"
+
+
+def test_a_number_is_held_against_what_the_description_has_not_got() -> None:
+    """Somebody has tuned 0.4 mm of an offset of 3.4 mm into the description: 3.0 mm are missing."""
+    offset = concealed("caster_offset_error", parameters={"x": 0.0034, "y": 0.0})
+    said = {"x": {"value": 0.003, "unit": "m", "ci95": [0.0029, 0.0031]}}
+    found = {}
+    for tuned in (0.0, 0.0004):
+        case = answer("masked", offset, retuned={"caster_offset.x/front_left": tuned})
+        [error] = judged(case, report(named("caster_offset_error", parameters=said))).parameter_errors()
+        found[tuned] = error
+    assert not found[0.0].covered and found[0.0].error > 0.1
+    assert found[0.0004].covered and found[0.0004].error < 1e-9
+
+
 def test_statistics_by_known_numbers() -> None:
     """Wilson against an independent implementation; the others counted by hand."""
     for count, total in ((0, 150), (1, 150), (75, 150), (120, 120), (1, 3)):

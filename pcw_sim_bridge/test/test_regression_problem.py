@@ -10,6 +10,7 @@ from scipy import signal
 
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, Selection
 from pcw_sim_bridge.mismatch.explanation import named_terms
+from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.regression_problem import (
     Channel,
@@ -20,6 +21,7 @@ from pcw_sim_bridge.mismatch.regression_problem import (
     Term,
 )
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
+from pcw_sim_bridge.mismatch.shape_search import refined_shape
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
@@ -203,6 +205,31 @@ def test_a_shape_that_is_tried_has_the_evidence_of_its_fit():
             assert allowed == regression.each_within_bounds(fit)[-1]
 
 
+def test_a_shape_is_found_where_the_fit_was_made_exact_far_from_it():
+    """Nearly two steps of the grid away, and no neighbour looked at: each step goes further than the one before."""
+    time = np.arange(20 * SAMPLES) / RATE
+    rng = np.random.default_rng(3)
+
+    def ripple(order: float) -> np.ndarray:
+        return np.sin(order * time)[:, None, None]
+
+    problem = one_channel(
+        np.sin(time),
+        ripple(34.0)[:, 0, 0] + 0.1 * rng.standard_normal(len(time)),
+        nuisances=(Nuisance("number", "1", 0.0, 1e-3, np.cos(0.3 * time)[:, None]),),
+        terms=(
+            Term(
+                "ripple", ("axis",), (LinearParameter("size", "1", -9.0, 9.0, 3.0),), ({"order": 33.995},),
+                lambda shape: ripple(shape["order"]), resolution={"order": ("linear", 0.006)},
+            ),
+        ),
+    )  # fmt: skip
+    search = EffectSearch(problem, rng)
+    regression = search.whiten_at(problem.residual)
+    found = refined_shape(regression, (), Instance(0, (("order", 33.9895),), (0,)), coarse=False)
+    assert dict(found.shape)["order"] == pytest.approx(34.0, abs=1e-4)
+
+
 def test_what_is_at_the_description_stays_there_without_a_model():
     """A problem whose columns are exact everywhere is never moved."""
     problem = dataclasses.replace(curved_problem(2.0, 0.0), exact=None, derive=None)
@@ -278,6 +305,22 @@ def test_a_small_effect_that_no_error_of_the_model_looks_like_counts(drift, name
     assert chosen(dataclasses.replace(problem, drifts=drifts)) == named
 
 
+def test_what_a_gate_stops_gives_way_to_its_like_that_passes():
+    """Two columns do nearly the same. That which does more holds the residual's noise and is less than that: no finding."""
+    time = np.arange(3000) / RATE
+    plain = np.sin(2.1 * time)
+    noise = 0.5 * np.random.default_rng(5).standard_normal(len(time))
+    mixed = plain + 0.1 * np.sin(9.0 * time)
+    problem = linear_problem(0.35 * mixed + noise, {"noisy": (mixed, 100.0), "plain": (plain, 100.0)})
+    problem = dataclasses.replace(problem, terms=(dataclasses.replace(problem.terms[0], noisy=True), problem.terms[1]))
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    best = (Instance(0, (), (0,)),)
+    regression = search.whiten_at(search.residual_of(best))
+    assert regression.fit(best).log_evidence > regression.fit((Instance(1, (), (0,)),)).log_evidence
+    selection = search.prune(regression, best, 9.0)
+    assert [problem.terms[i.term].effect for i in selection.fit.instances] == ["plain"]
+
+
 def test_what_happens_once_must_stand_above_other_bursts():
     """The model errs in bursts: a shape that fits one of five is no event, and it is one where there is no other."""
     rng = np.random.default_rng(3)
@@ -314,6 +357,20 @@ def test_noise_in_its_columns_is_no_need_of_an_effect():
     effect = {"same": (number, 100.0)}
     assert chosen(linear_problem(left, effect)) == ["same"]
     assert chosen(linear_problem(left, effect, noisy=True)) == []
+
+
+def test_what_the_model_does_wrong_in_a_wilder_motion_speaks_against_no_effect():
+    """A number eight tolerances off, held against a recording of which forty times the noise is left in any case."""
+    time = np.arange(3000) / RATE
+    works, wild = np.cos(0.3 * time) + 0.3 * np.sin(1.1 * time), np.sin(2.9 * time)
+    noise = 0.01 * np.random.default_rng(7).standard_normal((2, len(time)))
+    fitted = linear_problem(0.008 * works + noise[0], {"same": (works, 100.0)})
+    wilder = linear_problem(0.008 * works + noise[1] - 0.4 * wild, {"same": (works, 100.0)})
+    search = EffectSearch(fitted, np.random.default_rng(0))
+    same = (Instance(0, (), (0,)),)
+    held_out = HeldOut.recordings(fitted, same, (0,), search.conclude(same, 9.0), wilder)
+    nats, work = held_out.help_of(0)
+    assert work > 0.0 and nats > 9.0  # which its tolerance says
 
 
 def odds_of_second(residual: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, float]:

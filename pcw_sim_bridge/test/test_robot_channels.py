@@ -11,7 +11,8 @@ from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed
+from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, used_friction
 from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
 from pcw_sim_bridge.mismatch.rolling_model import ChannelLayout, ModelNumbers
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -216,3 +217,35 @@ def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path:
     effects = {term.effect for term in problem.terms}
     assert {"wheel_radius_error", "imu_bias", "clock_offset"} <= effects
     assert not {"drive_coulomb_friction", "torque_constant_error"} & effects
+
+
+def test_a_cogging_turns_with_the_wheel_and_not_with_what_is_read_of_it(tmp_path: Path) -> None:
+    """With a steering zero 20 mrad off a ripple of order 34 is read 0.7 rad away from where it is; the numbers say both."""
+    cogging = {"cosine": 0.3, "sine": 0.1, "order": 34.0}
+    entries = [
+        {"name": "motor_cogging", "target": ["rear_left"], "axis": "steer", **cogging},
+        {"name": "steer_zero_offset", "target": ["rear_left"], "offset": 0.02},
+    ]
+    true = dataclasses.replace(THESIS, physics=read_physics(entries, THESIS.caster_names))
+    problem = RobotProblemBuilder(THESIS, [record(tmp_path, true, 9)]).build()
+    place = [term.key for term in problem.terms].index("motor_cogging/steer of rear_left")
+    size = SizedTerm(place, (("order", 34.0),), np.array([0.3, 0.1]))
+    left = {}
+    for zero in (0.0, -0.02):
+        assert problem.exact is not None
+        residual, _ = problem.exact({"steer_zero/rear_left": zero}, [size])
+        left[zero] = float(np.sqrt(np.mean(residual[problem.valid[:, 2], 2] ** 2)))
+    assert left[-0.02] < 0.5 * left[0.0]
+
+
+def test_a_tyre_near_its_peak_is_not_asked_how_much_it_slips() -> None:
+    """Of four wheels one uses nine tenths of what it can; of a floor that gives more it uses less."""
+    numbers = ModelNumbers.of(THESIS)
+    mu = THESIS.contact.mu_p
+    force = np.full((2, THESIS.n, 2), [0.1 * mu * 200.0, 0.0])
+    force[1, 2] = [0.0, 0.9 * mu * 200.0]
+    state = SimpleNamespace(force=force, grip=np.full((2, THESIS.n), 200.0))
+    assert used_friction(numbers, state) == pytest.approx([0.1, 0.9])  # type: ignore[arg-type]
+    assert used_friction(numbers, SimpleNamespace(force=force, grip=1.5 * state.grip)) == pytest.approx(  # type: ignore[arg-type]
+        [0.1 / 1.5, 0.6]
+    )

@@ -16,6 +16,8 @@ ABOVE_BURSTS = 3.0
 # By so much more must effects stand out whose columns hold noise that the residual holds; and by so much more again where they
 # are on all casters alike: what gears that wind up do to all wheels at once, a chassis that pitches on its springs does, too.
 NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
+# An effect that by itself is so many deviations of the model's scale is no wrong scale, though others undo most of it.
+BEYOND_SCALE = 20.0
 
 
 class EffectGates:
@@ -70,7 +72,7 @@ class EffectGates:
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
             floors = remains, self.settings.smallest_part * total
-            share = self._share(regression, [instance], changes[index], sizes, floors)
+            share = self._share(regression, [instance], changes[index], sizes, floors, own[index])
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
             needed = retunings[index] / self.settings.smallest_threshold
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
@@ -124,11 +126,12 @@ class EffectGates:
         change: FloatArray,
         sizes: FloatArray,
         floors: tuple[FloatArray, FloatArray],
+        own: FloatArray | None = None,
     ) -> float:
         """Contribution of some instances, a change (T, C) of sizes (C,), against the smallest that counts.
 
         That is what the model itself misjudges, unless the change does not look like it; and in any case a part of what
-        remains, the first of the floors (C,), and the second one.
+        remains, the first of the floors (C,), and the second one. `own` is what a single one does by itself (C,).
         """
         remains, part = floors
         least = max(self._least(instance) for instance in instances)
@@ -137,8 +140,16 @@ class EffectGates:
         seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * remains, part), 1e-300)))
         if share >= 1.0 or seen < 1.0 or self.problem.drifts is None:
             return share
-        wanted = self.settings.least_peculiar * self._noise_factor(instances)
+        wanted = self.settings.least_peculiar
+        if own is None or not self._beyond_scale(instances, own):
+            wanted *= self._noise_factor(instances)
         return max(share, min(seen, regression.peculiar(change) / wanted))
+
+    def _beyond_scale(self, instances: Sequence[Instance], own: FloatArray) -> bool:
+        """Whether what is in proportion to something measured is more than any error of its scale, by itself (C,)."""
+        curved = any(self.problem.terms[instance.term].is_curved for instance in instances)
+        scale = self.problem.scale_deviation * self._sizes(self.problem.measured)
+        return not curved and bool(np.any((scale > 0.0) & (own > BEYOND_SCALE * scale)))
 
     def _least(self, instance: Instance) -> float:
         """Part of what remains in some channel that a term must do at least.

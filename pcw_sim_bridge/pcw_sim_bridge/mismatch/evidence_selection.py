@@ -264,7 +264,7 @@ class EffectSearch:
             for part in STEPS:
                 if not self._exact_at(fit, part):
                     if self.problem.point is None or self.problem.point.derived:
-                        return instances
+                        return self._reshaped(instances, residual, False)
                     # With the slopes of another place one arrives where those are level, and not where the error is least.
                     self.problem, again = self.problem.derived(), instances
                     break
@@ -630,9 +630,14 @@ class EffectSearch:
             point = self.problem.point
             elsewhere = point is not None and any(size.term == instances[index].term for size in point.sizes)
             dropped.add(instances[index].term)
+            stand_in = None
             if loss >= threshold:
                 rejected.add(instances[index].term)
+                stand_in = self._stand_in(regression, instances, index, threshold, dropped)
             instances = instances[:index] + instances[index + 1 :]
+            if stand_in is not None:
+                self.progress(f"+ {self.label(stand_in)} in its place")
+                instances = (*instances, stand_in)
             if elsewhere:  # the problem is exact at another place without the dropped one
                 self._exact_at(regression.fit(instances))
                 regression = regression.moved(self.problem)
@@ -644,6 +649,30 @@ class EffectSearch:
                 self.progress(exchange[0])
                 instances = exchange[1]
         return self.conclude(instances, threshold)
+
+    def _stand_in(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], index: int, threshold: float, barred: set[int]
+    ) -> Instance | None:
+        """An effect that does nearly what one does that fails its gates, and that passes them beside the others."""
+        others, gates = instances[:index] + instances[index + 1 :], EffectGates(self.problem, self.settings)
+        fit, without = regression.fit(instances), regression.fit(others)
+        tried = 0
+        for candidate in regression.scan(others)[0]:
+            if not math.isfinite(candidate.gain) or without.log_evidence + candidate.gain < fit.log_evidence - FAR:
+                break
+            if candidate.instance.term in barred or self.repeats(candidate.instance, others):
+                continue
+            rival = refined_shape(regression, others, candidate.instance)
+            trial = regression.fit((*others, rival))
+            if trial.log_evidence < fit.log_evidence - ALIKE or not regression.within_bounds(trial):
+                continue
+            losses, held_out, shares = gates.judge(regression, (*others, rival), trial)
+            if losses[-1] >= threshold and held_out[-1] > 0.0 and shares[-1] >= 1.0:
+                return rival
+            tried += 1
+            if tried == MOST_ALIKE:
+                break
+        return None
 
     def _note_drop(self, label: str, loss: float, reason: str, held_out: float | None = None) -> None:
         self.progress(f"- {label}: {loss:.1f} nats, {reason}")

@@ -13,7 +13,8 @@ import numpy as np
 
 from .evidence_selection import Selection
 from .manoeuvres import manoeuvres
-from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .noise_model import channel_deviations, huber_weights
+from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProblem
 from .whitened_regression import Instance, WhitenedRegression
 
 FOLDS = 4  # parts that manoeuvres are dealt out to in turn
@@ -59,8 +60,13 @@ class HeldOut:
         columns = _columns_elsewhere(problem, instances, other)
         flat = np.concatenate([columns, other.residual[:, :, None]], axis=2)
         everything = np.zeros(len(other.time), dtype=np.int64)
+        train = regression.grams(instances).sum(axis=0)
+        deviations = regression.deviations(instances)
+        mean = np.linalg.solve(train[:-1, :-1] + np.diag(1.0 / deviations**2), train[:-1, -1])
         judged = WhitenedRegression(other, regression.noise, np.ones_like(other.residual), everything)
         white = judged.whiten_columns(flat)
+        left = judged.spread(white[:, -1] - white[:, :-1] @ mean)
+        white *= np.sqrt(judged.gather(_trust(left, other.valid)))[:, None]
         count = len(np.unique(other.recording))
         return cls(
             other,
@@ -68,9 +74,9 @@ class HeldOut:
             tuple(proposed),
             columns,
             everything,
-            regression.grams(instances).sum(axis=0)[None],
+            train[None],
             (white.T @ white)[None],
-            regression.deviations(instances),
+            deviations,
             len(problem.nuisances),
             f"{count} held-out recording{'s' if count > 1 else ''}",
         )
@@ -161,6 +167,17 @@ class HeldOut:
         factor = np.linalg.cholesky(np.outer(deviations, deviations) * gram[np.ix_(kept, kept)] + np.eye(len(kept)))
         half = np.linalg.solve(factor, deviations * gram[kept, -1])
         return -float(np.sum(np.log(np.diag(factor)))) - 0.5 * float(gram[-1, -1] - half @ half)
+
+
+def _trust(left: FloatArray, valid: BoolArray) -> FloatArray:
+    """Weights of held-out samples (T, C), from what the fit leaves of them, whitened by the noise of the fitted ones.
+
+    Where a motion is wilder than all that was fitted, what the model does wrong there is no noise of the fitted recordings:
+    it would make sure of differences between two sets of effects that mean nothing.
+    """
+    deviations = np.maximum(channel_deviations(left, valid), 1.0)
+    weights: FloatArray = huber_weights(left / deviations) / deviations**2
+    return weights
 
 
 def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> RegressionProblem:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import ndimage
 
-from pcw_description.contact.contact_model import LAMBDA, LATERAL_LAMBDA
+from pcw_description.contact.contact_model import LAMBDA, LATERAL_LAMBDA, LATERAL_MU, MU
 from pcw_description.effects.drive_coulomb_friction import SMOOTHING_SPEED
 from pcw_description.errors import PcwError
 from pcw_description.recording import Recording
@@ -37,12 +37,14 @@ from .robot_nuisances import (
     varied_numbers,
 )
 from .robot_terms import robot_terms
-from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, at_place, twists
+from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
 from .signal_filter import SignalFilter
 from .sudden_slip import sudden_slip
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
 SLIP_FLOOR, SLIP_PART = 0.03, 0.75
+# Part of a tyre's friction up to which its force says how much it slips: at the peak any slip goes with the same force.
+USED_PART = 0.8
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
 TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
@@ -227,17 +229,8 @@ class RobotProblemBuilder:
     def _valid(self, differences: ChannelDifferences) -> BoolArray:
         """Samples (T, C) that the rolling model can judge: moving, no gross slip or shaking, sensor there."""
         pieces = []
-        numbers = self.numbers
-        reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
         for motion, known in zip(self.motions, differences.known, strict=True):
-            twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
-            slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
-            allowed = allowed_slip(numbers, twist)
-            bad = slip > allowed
-            if not self.layout.redundant:
-                rolled = at_place(twist, numbers.tracked)
-                bad = sudden_slip(motion.tracked_twist, rolled, motion.rate, reach, allowed)
-            bad = bad | (motion.shaking > SHAKING_PART * allowed)
+            bad = sliding(self.numbers, motion, self.layout)
             bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
@@ -315,6 +308,28 @@ def allowed_slip(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
     speed = np.hypot(twist[:, 0], twist[:, 1]) + np.abs(twist[:, 2]) * reach
     allowed: FloatArray = SLIP_FLOOR + SLIP_PART * float(np.min(numbers.tyres[:, [LAMBDA, LATERAL_LAMBDA]])) * speed
     return allowed
+
+
+def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -> BoolArray:
+    """Return the rows (T,) of a motion in which wheels slide, shake, or use so much friction that their slip is open."""
+    twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
+    allowed = allowed_slip(numbers, twist)
+    if layout.redundant:
+        bad: BoolArray = np.max(np.linalg.norm(contradiction, axis=2), axis=1) > allowed
+    else:
+        reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
+        bad = sudden_slip(motion.tracked_twist, at_place(twist, numbers.tracked), motion.rate, reach, allowed)
+    bad = bad | (motion.shaking > SHAKING_PART * allowed)
+    if layout.balanced:
+        bad |= used_friction(numbers, rolling_state(motion, numbers, layout)) > USED_PART
+    return bad
+
+
+def used_friction(numbers: ModelNumbers, state: RollingState) -> FloatArray:
+    """Return the force of the tyre that is used most, as a part of its friction (T,)."""
+    friction = np.minimum(numbers.tyres[:, MU], numbers.tyres[:, LATERAL_MU]) * state.grip
+    used: FloatArray = np.max(np.linalg.norm(state.force, axis=2) / friction, axis=1)
+    return used
 
 
 def disturbed(bad: BoolArray, reach: int) -> BoolArray:

@@ -232,6 +232,8 @@ class ChannelModel:
             for name in instance.target:
                 i = self.robot.caster_index(name)
                 position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.quiet_torque))
+                if axis == STEER:  # of the heading, whatever is read of it
+                    position = position + self.numbers.steer_zero[i]
                 torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
             return dataclasses.replace(around, torque=torque)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()

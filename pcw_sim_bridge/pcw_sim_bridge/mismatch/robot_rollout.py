@@ -14,11 +14,11 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDes
 
 from ..plants.reduced import ReducedPlant, WindowStarts
 from ..plants.true_robot import as_it_really_is
-from .regression_problem import BoolArray, FloatArray, IntArray
-from .robot_channels import STILL_SPEED, allowed_slip
+from .regression_problem import FloatArray, IntArray
+from .robot_channels import STILL_SPEED, sliding
 from .robot_effects import true_motion, with_pose
 from .robot_motion import LARGEST_CUTOFF, RobotMotion, read_motions
-from .rolling_model import ModelNumbers, twists
+from .rolling_model import ChannelLayout, ModelNumbers, twists
 from .rollout import HORIZONS, Windows, rows_of, window_rows
 from .signal_filter import SignalFilter, derivative, white_noise_level
 
@@ -130,20 +130,14 @@ def _changes(part: RobotPart) -> FloatArray:
     ends, there = part.ends()
     seen = _signals(part, motion.position, motion.velocity, part.path)
     change = _squares(seen[ends] - seen[part.starts][:, None])
-    usable = ~_sliding(part.numbers, motion)
+    casters = tuple(map(str, range(motion.position.shape[1])))
+    usable = ~sliding(part.numbers, motion, ChannelLayout(casters, balanced=True, imu=False, pose=False))
     # A window can be judged as long as nothing slid since it began, its lead included, and something moved.
     slid = np.concatenate([[0], np.cumsum(~usable)])
     still = np.concatenate([[0], np.cumsum(np.any(np.abs(motion.velocity[:, :, DRIVE]) > STILL_SPEED, axis=1))])
     first = part.starts[:, None] - part.lead
     fit = (slid[ends + 1] == slid[first]) & (still[ends + 1] > still[part.starts[:, None]])
     return change * np.where(fit, there, np.nan)[:, :, None]
-
-
-def _sliding(numbers: ModelNumbers, motion: RobotMotion) -> BoolArray:
-    """Rows (T,) with gross slip, by the measure of the channels."""
-    twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
-    slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
-    return np.asarray(slip > allowed_slip(numbers, twist))
 
 
 def _signals(part: RobotPart, position: FloatArray, velocity: FloatArray, path: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ UNSEEN_STEPS = 200.0  # to either side of what happens once, on a linear scale
 COARSE = 7  # points between the neighbours on the grid
 SWEEPS = 3  # over all parameters, as long as one gains
 WORTH = 0.1  # nats; a further point that promises less is not asked for
-PARABOLAS = 6
+PARABOLAS = 8
 
 
 def refined_shape(
@@ -132,6 +132,7 @@ def _largest(place: _Place, width: float, coarse: bool) -> float:
         left, middle, right = place.evidence(best - spacing), place.evidence(best), place.evidence(best + spacing)
         if max(left, right) > middle:
             best += spacing if right > left else -spacing
+            spacing = min(2.0 * spacing, width)  # it may be far: where the fit was last made exact the largest was elsewhere
             continue
         bend = left - 2.0 * middle + right
         if not math.isfinite(bend):

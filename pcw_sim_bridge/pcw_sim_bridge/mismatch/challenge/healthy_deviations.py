@@ -25,13 +25,14 @@ LARGEST_TYRE_DEVIATION = 1.4
 # No tyre gives less than this part of what is described, however it is drawn or tuned.
 STIFFEST = 0.2
 RELAXATION = "contact.relaxation_length"
-# Effects that move healthy numbers and nothing else: which number each of their parameters moves.
+# Effects that move healthy numbers: which number each of their parameters moves.
 MOVED: Mapping[str, Mapping[str, str]] = {
     "wheel_radius_error": {"error": "wheel_radius/{caster}"},
     "caster_offset_error": {"x": "caster_offset.x/{caster}", "y": "caster_offset.y/{caster}"},
     "steer_zero_offset": {"offset": "steer_zero/{caster}"},
     "torque_constant_error": {"error": "torque_constant/{caster}_{axis}"},
     "payload_offset": {"x": "chassis.com.x", "y": "chassis.com.y"},
+    "payload_mass": {"mass": "chassis.mass"},
     "ground_slope": {"angle": "ground.slope.x"},  # whichever its direction: the tolerance is that of y
     "imu_lever_arm": {"x": "imu.position.x", "y": "imu.position.y"},
     "imu_bias": {
@@ -108,17 +109,23 @@ def tolerated_cost(robot: RobotDescription, instance: EffectInstance) -> float:
     Infinite where an effect is more than numbers that a healthy robot may differ in.
     """
     deviations = {number.name: number.deviation for number in healthy_numbers(robot)}
-    effect, moved = get(instance.name), MOVED.get(instance.name, {})
-    axis = instance.axis or effect.axis
     cost = 0.0
     for parameter, value in instance.parameters.items():
         if value == 0.0 or parameter in NO_NUMBERS:
             continue
-        if parameter not in moved:
+        names = numbers_moved(instance.name, instance.target, parameter, instance.axis)
+        if not names:
             return math.inf
-        names = {moved[parameter].format(caster=name, axis=axis) for name in instance.target}
         cost += sum(0.5 * (value / deviations[name]) ** 2 for name in names)
     return cost
+
+
+def numbers_moved(effect: str, target: Sequence[str], parameter: str, axis: str | None = None) -> tuple[str, ...]:
+    """Return which healthy numbers a parameter of an effect moves; none if it is no such parameter."""
+    pattern = MOVED.get(effect, {}).get(parameter)
+    if pattern is None:
+        return ()
+    return tuple(dict.fromkeys(pattern.format(caster=name, axis=axis or get(effect).axis) for name in target))
 
 
 def effect_instance(

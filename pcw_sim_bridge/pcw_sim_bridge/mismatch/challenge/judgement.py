@@ -11,6 +11,7 @@ from typing import Any
 from pcw_description.effects.registry import all_effects
 
 from .cases import LEAST_SIZE, Answer, is_of_the_floor
+from .healthy_deviations import numbers_moved
 from .outside_effects import OUTSIDE_EFFECTS
 
 Key = tuple[str, frozenset[str]]
@@ -143,8 +144,16 @@ class Judgement:
                 continue
             assert self.report is not None
             said = self.report["effects"][match.entries[0]]["parameters"]
-            found += [_error(effect, name, said[name]) for name, _ in _telling(effect) if name in said]
+            found += [
+                _error(effect, name, said[name], self._tuned_in(effect, name)) for name, _ in _telling(effect) if name in said
+            ]
         return found
+
+    def _tuned_in(self, effect: Mapping[str, Any], parameter: str) -> float:
+        """How much of a parameter somebody has tuned into the description already, on average over its targets."""
+        names = numbers_moved(effect["name"], effect["target"], parameter, effect["axis"])
+        tuned = [float(self.answer["retuned"].get(name, 0.0)) for name in names]
+        return sum(tuned) / len(tuned) if tuned else 0.0
 
     def locations(self) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
         """Pairs of a concealed effect and the location that the report gives the effect of that name."""
@@ -211,8 +220,15 @@ def _read(index: int, effect: Mapping[str, Any]) -> Named:
 
 
 def _merged(named: Sequence[Named], truth: Sequence[Key]) -> tuple[Named, ...]:
-    """Join findings of one name on parts of a target that is concealed as one."""
-    kept = list(named)
+    """Join findings of one name on parts of a target that is concealed as one, and those of both axes with a common rival."""
+    kept: list[Named] = []
+    for n in named:
+        same = next((k for k in kept if k.key == n.key and k.rivals & n.rivals), None)
+        if same is None:
+            kept.append(n)
+        else:  # torques that are all wrong by one factor, at the drives and at the steerings, are one finding: see its rivals
+            probability = min(same.probability, n.probability)
+            kept[kept.index(same)] = Named(n.key, probability, same.rivals & n.rivals, (*same.entries, *n.entries))
     for name, target in truth:
         parts = [n for n in kept if n.key[0] == name and n.key[1] < target]
         if len(parts) > 1 and sum(len(n.key[1]) for n in parts) == len(target):
@@ -232,8 +248,9 @@ def _telling(effect: Mapping[str, Any]) -> list[tuple[str, float]]:
     return [(name, value) for name, value in effect["parameters"].items() if value not in (defaults.get(name), 0.0)]
 
 
-def _error(effect: Mapping[str, Any], name: str, said: Mapping[str, Any]) -> ParameterError:
-    true, value, (low, high) = effect["parameters"][name], said["value"], said["ci95"]
+def _error(effect: Mapping[str, Any], name: str, said: Mapping[str, Any], tuned_in: float) -> ParameterError:
+    """Compare a number with the true one, of which the description may hold a part."""
+    true, value, (low, high) = effect["parameters"][name] - tuned_in, said["value"], said["ci95"]
     parameter = all_effects()[effect["name"]].parameter(name)
     if parameter.unit == "rad" and parameter.upper - parameter.lower > 2.0 * math.pi:
         turned = math.remainder(true - value, 2.0 * math.pi)
