@@ -35,8 +35,22 @@ def looked(left: np.ndarray, seed: int = 0) -> Looked:
     noisy = left + np.random.default_rng(seed).standard_normal(left.shape)
     return Looked(
         left=noisy, deviation=np.ones(left.shape[1]), valid=np.ones(left.shape, dtype=bool), time=time, rate=RATE,
-        angle=np.zeros((count, 4, 2)), places=centre[:, None] + corners, heading=np.repeat(heading[:, None], 4, axis=1),
+        recording=np.zeros(count, dtype=np.int64), angle=np.zeros((count, 4, 2)), places=centre[:, None] + corners,
+        heading=np.repeat(heading[:, None], 4, axis=1),
     )
+
+
+def test_a_push_in_one_of_two_recordings_is_found_there() -> None:
+    """Something as strong, the other way, was at work in the other one at that time: in both together there is nothing."""
+    left = np.zeros((1600, 1))
+    left[246:280], left[1046:1080] = 4.0, -4.0
+    both = looked(left)
+    both = dataclasses.replace(both, time=both.time % (800 / RATE), recording=np.repeat([0, 1], 800))
+    columns = np.ones((1600, 1, 1))
+    held, _ = both.only(1).held_against(columns)
+    assert not held[:800].any() and held[1046:1080].sum() < -50.0
+    assert windows(both.only(1), columns).shapes[0]["start"] == pytest.approx(246 / RATE, abs=0.1)
+    assert windows(both, columns).shapes[0]["start"] != pytest.approx(246 / RATE, abs=0.1)
 
 
 def test_the_time_of_a_push_is_found() -> None:

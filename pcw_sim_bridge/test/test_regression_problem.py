@@ -21,7 +21,7 @@ from pcw_sim_bridge.mismatch.regression_problem import (
     Term,
 )
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
-from pcw_sim_bridge.mismatch.shape_search import refined_shape
+from pcw_sim_bridge.mismatch.shape_search import refined_shape, shape_interval
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
@@ -228,6 +228,32 @@ def test_a_shape_is_found_where_the_fit_was_made_exact_far_from_it():
     regression = search.whiten_at(problem.residual)
     found = refined_shape(regression, (), Instance(0, (("order", 33.9895),), (0,)), coarse=False)
     assert dict(found.shape)["order"] == pytest.approx(34.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_what_happened_once_may_have_ended_beyond_a_time_when_it_had_not(once):
+    """Just beyond what can be judged a filter still sees the end; of what shapes a law such a place ends the interval."""
+    time = np.arange(SAMPLES) / RATE
+
+    def column(duration: float) -> np.ndarray:
+        seen = 0.5 * np.cos(5.3 * time) if 1.05 < duration < 1.3 else 0.0
+        return (np.sin(2.1 * time) + seen)[:, None, None]
+
+    problem = one_channel(
+        np.sin(time),
+        column(1.0)[:, 0, 0] + NOISE * np.random.default_rng(1).standard_normal(SAMPLES),
+        nuisances=(Nuisance("number", "1", 0.0, 1e-3, np.cos(0.3 * time)[:, None]),),
+        terms=(
+            Term(
+                "push", ("axis",), (LinearParameter("size", "1", -9.0, 9.0, 3.0),), ({"duration": 1.0},),
+                lambda shape: column(shape["duration"]), resolution={"duration": ("linear", 0.1)}, once=once,
+            ),
+        ),
+    )  # fmt: skip
+    regression = EffectSearch(problem, np.random.default_rng(0)).whiten_at(problem.residual, white=True)
+    low, high = shape_interval(regression, (), Instance(0, (("duration", 1.0),), (0,)), "duration")
+    assert low < 0.85
+    assert (high > 2.0) == once and (high < 1.06) != once
 
 
 def test_what_is_at_the_description_stays_there_without_a_model():

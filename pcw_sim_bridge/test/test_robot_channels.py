@@ -249,3 +249,27 @@ def test_a_tyre_near_its_peak_is_not_asked_how_much_it_slips() -> None:
     assert used_friction(numbers, SimpleNamespace(force=force, grip=1.5 * state.grip)) == pytest.approx(  # type: ignore[arg-type]
         [0.1 / 1.5, 0.6]
     )
+
+
+def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path) -> None:
+    """Exact where it was at work in the second, the model leaves the first as it was, and less of the second."""
+    push = {"name": "external_push", "target": ["chassis"], "force_x": 40.0, "start": 5.0, "duration": 2.0}
+    pushed = dataclasses.replace(THESIS, physics=read_physics([push], THESIS.caster_names))
+    recordings = [record(tmp_path, THESIS, 11), record(tmp_path, pushed, 12)]
+    problem = RobotProblemBuilder(THESIS, recordings).build()
+    keys = [term.key for term in problem.terms]
+    assert keys.count("external_push/chassis") == 1
+    term = keys.index("external_push/chassis in recording 2")
+    assert problem.terms[term].recording == 1
+    shape = {**problem.terms[term].shapes[0], "start": 5.0, "duration": 2.0}
+    second = problem.recording == 1
+    columns = problem.terms[term].columns(shape)
+    assert not columns[~second].any() and columns[second].any()
+    assert problem.exact is not None
+    sizes = np.array([40.0 * (parameter.name == "force_x") for parameter in problem.terms[term].parameters])
+    left = {}
+    for name, own in (("without", []), ("with", [SizedTerm(term, tuple(shape.items()), sizes)])):
+        residual, _ = problem.exact({}, own)
+        left[name] = [np.sqrt(np.mean(residual[problem.valid[:, 0] & rows, 0] ** 2)) for rows in (~second, second)]
+    assert left["with"][0] == pytest.approx(left["without"][0])
+    assert left["with"][1] < 0.5 * left["without"][1]

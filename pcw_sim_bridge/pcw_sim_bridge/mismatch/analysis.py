@@ -144,7 +144,7 @@ def analyse(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
             *(_traces(prover.other, proof.predicted, explanation.fit, "holdout") if prover.other is not None else ()),
         ),
-        notes=_notes(explanation, retuned, prover.other is not None, proof),
+        notes=_notes(explanation, retuned, prover.other is not None, proof, fit),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),
@@ -307,6 +307,7 @@ def _notes(
     retuned: Sequence[RetunedFinding],
     has_holdout: bool,
     proof: Proof,
+    recordings: Sequence[Path],
 ) -> tuple[str, ...]:
     """What a reader has to know to judge the findings."""
     notes = list(proof.notes)
@@ -315,6 +316,9 @@ def _notes(
         notes.append(f"{label} was withdrawn: what is left depends on {variable}, which that effect does not.")
     notes.extend(explanation.remarks)
     notes.extend(problem.remarks)
+    for named in explanation.named:
+        if named.term.recording is not None:
+            notes.append(f"{named.term.effect} was at work in one recording alone: {recordings[named.term.recording]}.")
     for number in retuned:
         if abs(number.value - number.nominal) > 3.0 * number.tolerance:
             times = abs(number.value - number.nominal) / number.tolerance

@@ -52,6 +52,8 @@ GATHERED_AMONG = 2  # candidates that several terms may be parts of
 DERIVED_AFTER = 2
 # Effects of so little less evidence [nats] are alike, and at most so many are tried; those of so much less are not looked at.
 ALIKE, MOST_ALIKE, FAR = 10.0, 3, 30.0
+# What stands in for an effect that a gate stops must be worth so much [nats]: of little, much is alike.
+LEAST_STAND_IN = 30.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
@@ -667,7 +669,7 @@ class EffectSearch:
             if trial.log_evidence < fit.log_evidence - ALIKE or not regression.within_bounds(trial):
                 continue
             losses, held_out, shares = gates.judge(regression, (*others, rival), trial)
-            if losses[-1] >= threshold and held_out[-1] > 0.0 and shares[-1] >= 1.0:
+            if losses[-1] >= max(threshold, LEAST_STAND_IN) and held_out[-1] > 0.0 and shares[-1] >= 1.0:
                 return rival
             tried += 1
             if tried == MOST_ALIKE:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import signal as filters
 
 from .noise_model import robust_deviation
-from .regression_problem import BoolArray, FloatArray, Nuisance
+from .regression_problem import BoolArray, FloatArray, IntArray, Nuisance
 
 LARGEST_ORDER = 400.0
 MOST_ORDERS = 4
@@ -57,7 +57,7 @@ class Looked:
     Attributes:
         left: over its noise, tolerances fitted, zero where it is not to be judged (T, C); deviation: that noise (C,).
         valid: samples that may be judged (T, C).
-        time: since each recording's start (T,) [s]; rate: samples per second.
+        time: since each recording's start (T,) [s]; recording: the number of that (T,); rate: samples per second.
         angle: of every joint (T, n, 2) [rad].
         places: of the wheels' centres in the world (T, n, 2) [m]; heading: of the wheels there (T, n) [rad].
     """
@@ -66,10 +66,15 @@ class Looked:
     deviation: FloatArray
     valid: BoolArray
     time: FloatArray
+    recording: IntArray
     rate: float
     angle: FloatArray
     places: FloatArray
     heading: FloatArray
+
+    def only(self, recording: int) -> Looked:
+        """Return the same with nothing to be judged in other recordings."""
+        return dataclasses.replace(self, valid=self.valid & (self.recording == recording)[:, None])
 
     def held_against(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """How much of columns (T, C, K) is in the residual, and how much there would be of one unit: (T, K) each."""

@@ -138,6 +138,7 @@ class Term:
         turning: a phase or a direction shapes it, of which two a quarter turn apart make all others.
         noisy: its columns hold some of the noise that the residual holds, by the control that acts on that noise.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
+        recording: the only one in which it is at work; None: it is in all, at the same time.
     """
 
     effect: str
@@ -158,12 +159,14 @@ class Term:
     turning: bool = False
     noisy: bool = False
     once: bool = False
+    recording: int | None = None
 
     @property
     def key(self) -> str:
         """Short label for logs and tables."""
         place = f"{self.axis} of " if self.axis else ""
-        return f"{self.effect}/{place}{'+'.join(self.target)}"
+        occasion = "" if self.recording is None else f" in recording {self.recording + 1}"
+        return f"{self.effect}/{place}{'+'.join(self.target)}{occasion}"
 
     def base_indices(self) -> tuple[int, ...]:
         """Positions of the parameters that are not refinements."""

@@ -119,7 +119,7 @@ class RobotProblemBuilder:
         if with_terms:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
-            looked = Looked(left, deviation, valid, time, rate, angle, *self._wheels())
+            looked = Looked(left, deviation, valid, time, recording, rate, angle, *self._wheels())
             terms = tuple(robot_terms(self.robot, differences, looked))
         return RegressionProblem(
             channels=self.channels(),
@@ -147,17 +147,20 @@ class RobotProblemBuilder:
     ) -> tuple[FloatArray, Sequence[str]] | None:
         """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be."""
         varied = [n for n in varied_numbers(self.robot, differences) if n.label in changes]
-        model = self._model_at(varied, terms, changes, sizes)
-        if model is None:
-            return None
         lean = np.array([*(changes.get(name, 0.0) for name in FLOOR), 0.0])
         pieces = []
-        for motion in self._motions_of(model):
-            around = model.around_leaning(motion, model.around(motion), lean) if lean.any() else model.around(motion)
-            measured, predicted = model.sides(motion, around)
-            if lean.any():
-                model.lean(motion, lean, measured, predicted)
-            pieces.append(np.nan_to_num(measured - predicted))
+        for recording in dict.fromkeys(motion.recording for motion in self._read):
+            # What happened in one recording alone was not at work in another.
+            own = [size for size in sizes if terms[size.term].recording in (None, recording)]
+            model = self._model_at(varied, terms, changes, own)
+            if model is None:
+                return None
+            for motion in self._motions_of(model, recording):
+                around = model.around_leaning(motion, model.around(motion), lean) if lean.any() else model.around(motion)
+                measured, predicted = model.sides(motion, around)
+                if lean.any():
+                    model.lean(motion, lean, measured, predicted)
+                pieces.append(np.nan_to_num(measured - predicted))
         return differences.filtered(pieces), [*(n.label for n in varied), *(name for name in FLOOR if name in changes)]
 
     def _derive(
@@ -165,7 +168,8 @@ class RobotProblemBuilder:
     ) -> Mapping[str, FloatArray] | None:
         """Columns (T, C) of the numbers where they are changed so and effects are at work; None where they cannot be."""
         varied = varied_numbers(self.robot, differences)
-        model = self._model_at([n for n in varied if n.label in changes], terms, changes, sizes)
+        lasting = [size for size in sizes if terms[size.term].recording is None]
+        model = self._model_at([n for n in varied if n.label in changes], terms, changes, lasting)
         if model is None:
             return None
         there = ChannelDifferences(model, self._motions_of(model), self.filters)
@@ -198,9 +202,10 @@ class RobotProblemBuilder:
             number.vary(numbers, changes[number.label])
         return ChannelModel(described, numbers, self.layout)
 
-    def _motions_of(self, model: ChannelModel) -> list[RobotMotion]:
-        """What was read, as the joints of a model moved."""
-        return with_pose([true_motion(model.robot, motion) for motion in self._read], model.numbers)
+    def _motions_of(self, model: ChannelModel, recording: int | None = None) -> list[RobotMotion]:
+        """What was read in one recording, or in all, as the joints of a model moved."""
+        read = [motion for motion in self._read if recording in (None, motion.recording)]
+        return with_pose([true_motion(model.robot, motion) for motion in read], model.numbers)
 
     def _wheels(self) -> tuple[FloatArray, FloatArray]:
         """Places (T, n, 2) [m] and headings (T, n) [rad] of the wheels in the world."""

@@ -61,20 +61,28 @@ class _TermMaker:
         """All candidates."""
         # Of one caster, each and all are the same.
         everything = list(dict.fromkeys([*((name,) for name in self.robot.caster_names), self.robot.caster_names]))
-        wanted: list[tuple[Effect, tuple[str, ...], str | None]] = []
+        wanted: list[tuple[Effect, tuple[str, ...], str | None, int | None]] = []
+        recordings = np.unique(self.looked.recording).tolist()
         for effect in all_effects().values():
             if isinstance(effect, ActuatorEffect):
                 continue
             targets = everything if effect.target_kind == "caster" else [(effect.target_kind,)]
             if _look_of(effect) in ("patches", "waves"):  # the floor is under all wheels
                 targets = [self.robot.caster_names]
-            wanted += [(effect, target, axis) for axis in effect.axes or (None,) for target in targets]
+            # What comes from outside at one time may come in one recording alone, or in each as if it were simulated.
+            occasions = [None, *recordings] if _look_of(effect) == "windows" and len(recordings) > 1 else [None]
+            wanted += [
+                (effect, target, axis, occasion)
+                for axis in effect.axes or (None,)
+                for target in targets
+                for occasion in occasions
+            ]
         return [term for term in on_all_cores(lambda one: self._term(*one), wanted) if term is not None]
 
-    def _term(self, effect: Effect, target: tuple[str, ...], axis: str | None) -> Term | None:
+    def _term(self, effect: Effect, target: tuple[str, ...], axis: str | None, recording: int | None) -> Term | None:
         if isinstance(effect, JointTorqueEffect):
             return self._joint_term(effect, target, axis)
-        return self._difference_term(effect, target, axis)
+        return self._difference_term(effect, target, axis, recording)
 
     # -- torques on joints --------------------------------------------------------------------------------------
 
@@ -162,8 +170,10 @@ class _TermMaker:
 
     # -- everything else ----------------------------------------------------------------------------------------
 
-    def _difference_term(self, effect: Effect, target: tuple[str, ...], axis: str | None) -> Term | None:
-        """A candidate by differences of the whole channel model; None if no channel shows it."""
+    def _difference_term(
+        self, effect: Effect, target: tuple[str, ...], axis: str | None, recording: int | None
+    ) -> Term | None:
+        """A candidate by differences of the whole channel model, in one recording or all; None if no channel shows it."""
         searched = self._searched(effect)
         if not searched or (isinstance(effect, ContactEffect) and not (self.layout.balanced or self._rolls_unevenly(effect))):
             return None
@@ -176,13 +186,17 @@ class _TermMaker:
             return None
         neutral = {p.name: self._neutral(p) for p in searched}
         look = _look_of(effect)
-        chosen = self._looked_for(effect, look, neutral) if look else self._grid(effect)
+        looked = self.looked if recording is None else self.looked.only(recording)
+        chosen = self._looked_for(looked, effect, look, neutral) if look else self._grid(effect)
         if chosen is None or not chosen.shapes:
             return None
         shapes = chosen.shapes
 
+        own = np.full(len(looked.time), True) if recording is None else looked.recording == recording
+
         def columns(shape: Shape, names: Sequence[str]) -> FloatArray:
-            return np.stack([self._difference(effect, target, axis, shape, neutral, name) for name in names], axis=2)
+            found = np.stack([self._difference(effect, target, axis, shape, neutral, name) for name in names], axis=2)
+            return np.where(own[:, None, None], found, 0.0)
 
         everything = columns(shapes[0], [p.name for p in searched])
         seen = np.abs(everything).max(axis=(0, 1)) > 0.0
@@ -213,6 +227,7 @@ class _TermMaker:
             # Where no torque was measured, tyres slip under the forces that the motion asks for, and its noise is in these.
             noisy=isinstance(effect, TransmissionEffect) or (effect.name.startswith("tyre_") and not self.layout.balanced),
             once=look in ("windows", "patches"),
+            recording=recording,
         )
 
     def _searched(self, effect: Effect) -> tuple[EffectParameter, ...]:
@@ -230,23 +245,23 @@ class _TermMaker:
         room[np.isinf(room)] = 0.0
         return room
 
-    def _looked_for(self, effect: Effect, look: str, neutral: Mapping[str, float]) -> ChosenShapes:
+    def _looked_for(self, looked: Looked, effect: Effect, look: str, neutral: Mapping[str, float]) -> ChosenShapes:
         """Where and when an effect may be at work, by a first look; its other parameters at their defaults."""
         rest = {p.name: p.default for p in effect.parameters if p.default is not None and p.name not in neutral}
         if look == "windows":
             always = {**rest, **neutral, "start": 0.0, "duration": 1e6}
             names = [p.name for p in effect.searched_parameters]
             columns = [self._difference(effect, ("chassis",), None, always, neutral, name) for name in names]
-            found = windows(self.looked, np.stack(columns, axis=2))
+            found = windows(looked, np.stack(columns, axis=2))
         elif look == "patches":
             everywhere = {**rest, **neutral, "x": 0.0, "y": 0.0, "length": 1e4, "width": 1e4}
             name = effect.searched_parameters[0].name
             casters = self.robot.caster_names
             columns = [self._difference(effect, (caster,), None, everywhere, neutral, name) for caster in casters]
-            found = patches(self.looked, np.stack(columns, axis=2))
+            found = patches(looked, np.stack(columns, axis=2))
         else:
             climbing = [self.differences.of_climbing(i) for i in range(self.robot.n)]
-            found = waves(self.looked, np.stack(climbing, axis=2))
+            found = waves(looked, np.stack(climbing, axis=2))
         return dataclasses.replace(found, shapes=tuple({**rest, **shape} for shape in found.shapes))
 
     def _difference(

@@ -60,15 +60,20 @@ def shape_interval(
     if not kind or (kind == "log" and centre <= 0.0):
         return centre, centre
     place = _Place(ShapeTrials(regression, others, instance), instance, name, kind)
-    # What happened once may have ended, or its patch, anywhere in a time or on a floor from which nothing can be judged.
-    steps = UNSEEN_STEPS if regression.problem.terms[instance.term].once else 2.0
+    # What happened once may have ended, or its patch, anywhere in a time or on a floor from which nothing can be judged: just
+    # beyond what can be judged the filter still sees it, and further away all is possible again.
+    once = regression.problem.terms[instance.term].once
+    steps = UNSEEN_STEPS if once else 2.0
     widest = math.log(WIDEST_RATIO) if kind == "log" else steps * spacing
     best, drop = place.evidence(0.0), DROP * widening
 
     def end(direction: float) -> float:
         inner, outer = 0.0, 1e-4 * (1.0 if kind == "log" else spacing)
-        while outer < widest and best - place.evidence(direction * outer) < drop:
-            inner, outer = outer, outer * 3.0
+        further = outer
+        while further < widest and (once or further == outer):
+            if best - place.evidence(direction * further) < drop:
+                inner, outer = further, further * 3.0
+            further *= 3.0
         for _ in range(5):
             middle = math.sqrt(inner * outer) if inner > 0.0 else 0.5 * outer
             if best - place.evidence(direction * middle) < drop:
