@@ -242,7 +242,6 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
 
 def _tyres(robot: RobotDescription) -> Iterator[Deviation]:
     yield "contact.stiffness", "contact.stiffness", 1.0, _entry("softness")
-    yield "contact.mu_p", "contact.mu_p", 1.0, _entry("friction")
     length = robot.contact.relaxation_length
 
     def relaxation(numbers: ModelNumbers, step: float) -> None:

@@ -41,7 +41,6 @@ from .subject import Opened
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
-MU_LARGEST = 5.0  # that a description holds
 CONTRADICTORY = 0.15  # of their speed, by which wheels of one robot do not contradict each other most of the time
 
 
@@ -303,23 +302,17 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
     """Return the robot with tyres that give more or less, each by what all share and by its own."""
     if not any(name.startswith("contact.") for name in retuned):
         return robot
-    common, friction = retuned.get("contact.stiffness", 1.0), _positive(retuned.get("contact.mu_p", 1.0), 1.0)
+    common = retuned.get("contact.stiffness", 1.0)
     length = retuned.get("contact.relaxation_length")
 
     def tyre(caster: str, old: ContactDescription) -> ContactDescription:
         along, across = (
             max(common + retuned.get(f"contact.stiffness/{caster}_{axis}", 1.0) - 1.0, LEAST_PART) for axis in AXIS_NAMES
         )
-        lateral = dataclasses.replace(
-            old.lateral, lambda_p=min(old.lateral.lambda_p * across, 1.0), mu_p=min(old.lateral.mu_p * friction, MU_LARGEST)
-        )
+        lateral = dataclasses.replace(old.lateral, lambda_p=min(old.lateral.lambda_p * across, 1.0))
         relaxation = old.relaxation_length if length is None else _positive(length, old.relaxation_length)
         return dataclasses.replace(
-            old,
-            mu_p=min(old.mu_p * friction, MU_LARGEST),
-            lambda_p=min(old.lambda_p * along, 1.0),
-            lateral=lateral,
-            relaxation_length=min(relaxation, 1.0),
+            old, lambda_p=min(old.lambda_p * along, 1.0), lateral=lateral, relaxation_length=min(relaxation, 1.0)
         )
 
     for name in robot.caster_names:

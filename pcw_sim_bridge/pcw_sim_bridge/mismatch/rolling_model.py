@@ -191,8 +191,7 @@ class ModelNumbers:
         imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
         axle: fixed axles (k, 3), k of 0 or 1: their middle [m] and heading [rad].
         tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
-        tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2); friction:
-            what they get hold of, per friction of these (n + k,).
+        tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
         heading_lead: how much later the headings were that belong to the rates beside them [s]. A simulation in steps that
             makes its rates from one set of angles, and the next angles from those rates, is half a step off.
@@ -221,7 +220,6 @@ class ModelNumbers:
     tracked: FloatArray
     tyres: FloatArray
     softness: FloatArray
-    friction: FloatArray
     torque_lag: float
     heading_lead: float
     clock: FloatArray
@@ -263,7 +261,6 @@ class ModelNumbers:
             tracked=tracked_place(robot),
             tyres=np.array([tyre_parameters(tyre) for tyre in (*robot.tyres, *(robot.contact for _ in robot.fixed_axle))]),
             softness=np.ones((robot.n + len(robot.fixed_axle), 2)),
-            friction=np.ones(robot.n + len(robot.fixed_axle)),
             torque_lag=0.0,
             heading_lead=0.0,
             clock=np.zeros(2),
@@ -640,10 +637,9 @@ def rolling_state(
     felt = _without(twist_dot, pull)
     n = len(numbers.steer_axis)
     normal = normal_forces(numbers, steer_angle, acceleration_of(twist, felt), around.height)
-    grip = normal * numbers.friction
+    grip = np.maximum(normal, 1.0)
     if around.grip is not None:
-        grip[:, :n] *= around.grip
-    grip = np.maximum(grip, 1.0)
+        grip[:, :n] = np.maximum(normal[:, :n] * around.grip, 1.0)
     speed = np.concatenate([np.abs(velocity[:, :, DRIVE] * numbers.radius), _axle_speeds(numbers, twist)], axis=1)
     patches = numbers.tyres[:n].copy()
     patches[:, LAMBDA] *= numbers.softness[:n, 0]  # the edge of a patch slips as the tyre does
