@@ -27,6 +27,7 @@ COARSE = 7  # points between the neighbours on the grid
 SWEEPS = 3  # over all parameters, as long as one gains
 WORTH = 0.1  # nats; a further point that promises less is not asked for
 PARABOLAS = 8
+FARTHEST = 2.0  # distances of neighbours on the grid that one search goes
 
 
 def refined_shape(
@@ -136,7 +137,11 @@ def _largest(place: _Place, width: float, coarse: bool) -> float:
         place.look_at([best - spacing, best, best + spacing])
         left, middle, right = place.evidence(best - spacing), place.evidence(best), place.evidence(best + spacing)
         if max(left, right) > middle:
-            best += spacing if right > left else -spacing
+            further = best + (spacing if right > left else -spacing)
+            if abs(further) > FARTHEST * width:  # another wave altogether
+                spacing *= 0.3
+                continue
+            best = further
             spacing = min(2.0 * spacing, width)  # it may be far: where the fit was last made exact the largest was elsewhere
             continue
         bend = left - 2.0 * middle + right
