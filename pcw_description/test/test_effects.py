@@ -5,9 +5,13 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import math
+import os
 import pkgutil
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -253,6 +257,75 @@ def test_effect_of_another_package_is_found(install: Any) -> None:
     with pytest.raises(DescriptionError, match="0 to 100 N m/rad"):
         read_physics([{"name": "steering_spring", "stiffness": -2.0}], ["left", "right"])
     assert "drive_coulomb_friction" in all_effects()
+
+
+EFFECT_FILE = '''
+from pcw_description.compiled import compiled, compiled_joint_torque
+from pcw_description.effects.effect import EffectParameter
+from pcw_description.effects.kinds import JointTorqueEffect
+
+
+@compiled
+def pull(position, stiffness):
+    return -stiffness * position
+
+
+@compiled_joint_torque
+def spring(position, velocity, motor_torque, normal_force, parameters):
+    return pull(position, parameters[0]), 0.0
+
+
+EFFECT = JointTorqueEffect(
+    name="file_spring", target_kind="caster", axis="steer", summary="A spring.", sentence="A spring at {target}.",
+    parameters=(EffectParameter("stiffness", "N m/rad", "torque per angle", 0.0, 100.0, 1.0, linear=True),),
+    sensors=("joint_states",), torque=spring,
+)
+'''
+
+
+def test_effect_files_in_folders_of_the_path_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an installation: the folder is named in the environment, also for compiled kernels a second time."""
+    (tmp_path / "effects").mkdir()
+    (tmp_path / "effects" / "file_spring.py").write_text(EFFECT_FILE)
+    (tmp_path / "effects" / "robot_with_laws.yaml").write_text("no module\n")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.setenv("PCW_EFFECTS_PATH", os.pathsep.join([str(empty), str(tmp_path / "effects")]))
+    code = """
+import numpy as np
+from pcw_description.effects.registry import get
+one = np.ones(1)
+print(get("file_spring").contribution(one, one, one, one, {"stiffness": 2.0})[0])
+"""
+    for _ in range(2):
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        assert (run.stdout, run.stderr) == ("-2.0\n", "")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("1 / 0\n", "division by zero"),
+        ("x = 1\n", "no attribute 'EFFECT'"),
+        ("EFFECT = 3\n", "an instance of Effect"),
+        ("from pcw_description.effects.constant_load import EFFECT\n", "each name once"),
+        (None, "allowed: folders of effect files"),
+    ],
+)
+def test_a_path_that_holds_no_effects_is_refused(
+    content: str | None, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """The message names the folder or the file."""
+    folder = tmp_path / "effects"
+    if content is not None:
+        folder.mkdir()
+        (folder / "strange.py").write_text(content)
+    monkeypatch.setenv("PCW_EFFECTS_PATH", str(folder))
+    registry.all_effects.cache_clear()
+    request.addfinalizer(registry.all_effects.cache_clear)
+    with pytest.raises(DescriptionError) as caught:
+        all_effects()
+    assert said in str(caught.value) and str(folder if content is None else folder / "strange.py") in str(caught.value)
 
 
 def test_an_effect_can_be_known_for_a_while() -> None:

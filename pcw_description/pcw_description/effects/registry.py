@@ -1,4 +1,7 @@
-"""Finds every effect: the files of this folder, and entry points of other packages. Adding one edits no list."""
+"""Finds every effect: the files of this folder, of the folders in PCW_EFFECTS_PATH, and entry points of other packages.
+
+Adding one edits no list.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,12 @@ import contextlib
 import functools
 import importlib
 import importlib.metadata
+import importlib.util
+import os
 import pkgutil
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ..effect_instance import EffectInstance
@@ -15,21 +22,51 @@ from ..errors import DescriptionError, nearest_name
 from .effect import Effect
 
 ENTRY_POINT_GROUP = "pcw_description.effects"
+PATH_VARIABLE = "PCW_EFFECTS_PATH"
 _NOT_EFFECTS = ("effect", "kinds", "registry")
 
 
 @functools.cache
 def all_effects() -> Mapping[str, Effect]:
-    """Return every effect by name, sorted."""
+    """Return every effect by name, sorted.
+
+    Raises:
+        DescriptionError: a folder of PCW_EFFECTS_PATH that is none, a file in it that cannot be imported or holds no effect,
+            or a second effect of one name.
+    """
     package = importlib.import_module(__package__ or "pcw_description.effects")
     effects: dict[str, Effect] = {}
     for module_info in pkgutil.iter_modules(package.__path__):
         if module_info.name not in _NOT_EFFECTS:
             effect = importlib.import_module(f"{package.__name__}.{module_info.name}").EFFECT
             _add(effects, effect, f"{package.__name__}.{module_info.name}")
+    for folder in filter(None, os.environ.get(PATH_VARIABLE, "").split(os.pathsep)):
+        if not Path(folder).is_dir():
+            raise DescriptionError(PATH_VARIABLE, folder, f"allowed: folders of effect files, {os.pathsep!r} between them")
+        for path in sorted(Path(folder).glob("[!_]*.py")):
+            _add(effects, _effect_of(path), str(path))
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
         _add(effects, entry_point.load(), entry_point.value)
     return dict(sorted(effects.items()))
+
+
+def _effect_of(path: Path) -> object:
+    """Import a file and return its `EFFECT`.
+
+    Raises:
+        DescriptionError: it cannot be imported, or has none.
+    """
+    specification = importlib.util.spec_from_file_location(f"pcw_effects_{path.stem}", path)
+    assert specification is not None and specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[specification.name] = module  # where the cache of compiled kernels looks for it
+    try:
+        specification.loader.exec_module(module)
+        return module.EFFECT
+    except Exception as error:  # whatever a file of somebody else raises
+        del sys.modules[specification.name]
+        where = f"{PATH_VARIABLE}: {path}"
+        raise DescriptionError(where, str(error), "allowed: a module with a module-level EFFECT") from error
 
 
 @contextlib.contextmanager

@@ -7,11 +7,12 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
-from pcw_description.effects.registry import get
+from pcw_description.effects.registry import all_effects, also_known, get
 
 from .command_findings import command_findings
 from .evidence_selection import LadderStep
@@ -35,6 +36,7 @@ from .proof import Proof, Prover, with_channels
 from .regression_problem import FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .subject import Subject
+from .unknown_law import Law
 from .whitened_regression import Fit, predicted
 
 Progress = Callable[[str], None]
@@ -52,10 +54,16 @@ DETERMINED_PART = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class Analysis:
-    """What an analysis gives: findings for people, and the patched subject for programs."""
+    """What an analysis gives: findings for people, and the patched subject for programs.
+
+    Attributes:
+        with_laws: the patched description with the laws outside the library that help, for simulators that know the files of
+            their effects; None where there are none.
+    """
 
     findings: Findings
     patched: Subject
+    with_laws: Mapping[str, Any] | None = None
 
 
 def analyse(
@@ -118,6 +126,7 @@ def analyse(
     numbers = _reported_numbers(explanation) if proof.tuned else {}
     patched = subject.patched(instances, numbers) if instances else subject
     leftovers = (*explanation.leftovers, *commands.leftovers)
+    unknown = _unknown(leftovers, proof.laws, [str(path) for path in fit])
     verdict = {
         (True, False): "explained",
         (True, True): "partly_explained",
@@ -136,7 +145,7 @@ def analyse(
             *(locate_leftover(explanation, leftover, path) for leftover in explanation.leftovers),
         ),
         effects=tuple(_effect_finding(subject, named, e) for named, e in everything),
-        unknown=_unknown(leftovers, [str(path) for path in fit]),
+        unknown=unknown,
         retuned=retuned,
         fit=with_channels(proof.finding, commands.proofs),
         ladder=(*_ladder(explanation.selection.ladder), *proof.dropped, *commands.ladder),
@@ -149,7 +158,21 @@ def analyse(
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),
     )
-    return Analysis(findings, patched)
+    return Analysis(findings, patched, _with_laws(subject, instances, _reported_numbers(explanation), unknown, proof.tuned))
+
+
+def _with_laws(
+    subject: Subject,
+    instances: Sequence[EffectInstance],
+    numbers: Mapping[str, float],
+    unknown: Sequence[UnknownFinding],
+    tuned: bool,
+) -> Mapping[str, Any] | None:
+    """The patched description with the laws that are effects; see `Analysis`."""
+    made = [left.effect for left in unknown if left.helps and left.effect is not None]
+    laws = [EffectInstance(effect.name, effect.target, effect.parameters, None) for effect in made]
+    with also_known(effect.effect() for effect in made):
+        return subject.patched([*instances, *laws], numbers if tuned else {}).mapping() if laws else None
 
 
 def _instance(named: NamedTerm) -> EffectInstance:
@@ -163,20 +186,23 @@ def _reported_numbers(explanation: Explanation) -> dict[str, float]:
     return {number.name: number.value for number in _retuned(explanation.search.problem, explanation.fit)}
 
 
-def _unknown(leftovers: Sequence[Leftover], recordings: Sequence[str]) -> tuple[UnknownFinding, ...]:
+def _unknown(
+    leftovers: Sequence[Leftover], proved: Sequence[Law], recordings: Sequence[str]
+) -> tuple[UnknownFinding, ...]:
     """What is left, with a file for every law that the kernel of an effect can hold."""
     found: list[UnknownFinding] = []
     for left in leftovers:
         effect, reason = None, ""
         if left.law is not None:
-            taken = [other.effect.name for other in found if other.effect is not None]
+            taken = [*all_effects(), *(other.effect.name for other in found if other.effect is not None)]
             try:
                 effect = generate(left.law, left.weights, recordings, taken)
             except NoSuchKernelError as error:
                 reason = str(error)
         variables = left.depends_on or (left.variable,)
         share = float(min(left.share, 1.0))
-        found.append(UnknownFinding(left.channel, variables, left.expression, share, effect, reason))
+        helps = any(left.law is law for law in proved)
+        found.append(UnknownFinding(left.channel, variables, left.expression, share, effect, reason, helps))
     return tuple(found)
 
 

@@ -409,12 +409,13 @@ class AxisProblemBuilder:
         return self._filtered(per_motion)[:, None, :]
 
     def _term(self, effect: JointTorqueEffect, smoothing: float) -> Term:
-        fixed = {p.name: smoothing for p in effect.nonlinear_parameters if p.name == SMOOTHING}
+        fixed = {p.name: p.default for p in effect.nonlinear_parameters if p.default is not None}
+        fixed |= {SMOOTHING: smoothing} if SMOOTHING in fixed else {}
         shapes: list[dict[str, float]] = [dict(fixed)]
         resolution: dict[str, tuple[str, float]] = {}
         periodic = None
         for parameter in effect.nonlinear_parameters:
-            if parameter.name == SMOOTHING:
+            if parameter.name in fixed:
                 continue
             grid, kind, step = self._shape_grid(parameter)
             resolution[parameter.name] = (kind, step)

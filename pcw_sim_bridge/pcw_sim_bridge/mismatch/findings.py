@@ -109,6 +109,7 @@ class UnknownFinding:
         depends_on: variables, the leading one first.
         effect: a file by which simulators can use it, in folder `effects` of the report; None where there is none.
         without_effect: why there is none; "" where nothing acts like a torque or force.
+        helps: whether it is part of the patch that is proved on held-out data.
     """
 
     channel: str
@@ -117,6 +118,7 @@ class UnknownFinding:
     share_explained: float
     effect: GeneratedEffect | None = None
     without_effect: str = ""
+    helps: bool = False
 
     def effect_entry(self) -> dict[str, Any] | None:
         """Return what report.json says of the file."""
@@ -345,13 +347,21 @@ class Findings:
             "ladder": [dataclasses.asdict(step) for step in self.ladder],
             "absent": [{"sensor": sensor, "cost": cost} for sensor, cost in self.absent],
             "generated_effects": [
-                {"unknown": k, "effect": leftover.effect_entry(), "without_effect": leftover.without_effect}
+                {
+                    "unknown": k, "effect": leftover.effect_entry(), "without_effect": leftover.without_effect,
+                    "helps_held_out": leftover.helps,
+                }
                 for k, leftover in enumerate(self.unknown)
                 if leftover.effect is not None or leftover.without_effect
             ],
             "notes": list(self.notes),
             "seconds": self.seconds,
         }
+
+    @property
+    def is_patched(self) -> bool:
+        """Whether anything is modelled that the description leaves out."""
+        return bool(self.effects) or any(leftover.helps for leftover in self.unknown)
 
     def limits(self) -> str:
         """What a verdict does not cover, as words after "nothing is missing"; "" where forces were judged."""
@@ -381,7 +391,7 @@ class Findings:
             fit = "no held-out data"
         else:
             before, after = self.fit.inverse_nrmse
-            closed = f"; {100 * self.fit.gap_closed:.0f} % of the gap closed" if self.effects else ""
+            closed = f"; {100 * self.fit.gap_closed:.0f} % of the gap closed" if self.is_patched else ""
             fit = f"NRMSE {before:.3f} before, {after:.3f} after{closed} ({self.fit.source})"
         warnings = sum(len(i.warnings) for i in self.inputs)
         return [

@@ -9,6 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pcw_description.effects.effect import Effect
 
 from .errors import MismatchError
 from .leftover_expression import LINEAR, ONE, Atom, ClosedForm
@@ -28,6 +33,7 @@ LOOK_ALIKES = {
     "chassis": ("aerodynamic_drag", "external_push"),
 }
 LARGEST_FACTOR = 100.0  # how far a number may lie from the one found
+SCALE = "scale"  # what a curve or map as a whole is multiplied by
 
 
 class NoSuchKernelError(MismatchError):
@@ -49,6 +55,14 @@ class GeneratedEffect:
     target: tuple[str, ...]
     parameters: Mapping[str, float]
     source: str
+
+    def effect(self) -> Effect:
+        """Return what a reader of the file gets, without a file."""
+        module: dict[str, Any] = {"__name__": self.name}
+        exec(compile(self.source, f"<{self.name}>", "exec"), module)
+        effect = module["EFFECT"]
+        assert isinstance(effect, Effect)
+        return effect
 
 
 def generate(law: Law, weights: FloatArray, recordings: Sequence[str], taken: Sequence[str] = ()) -> GeneratedEffect:
@@ -85,7 +99,7 @@ def _joint_torque(law: Law, weights: FloatArray, recordings: Sequence[str], take
     if len(set(arguments)) > 1:
         raise NoSuchKernelError("its places depend on different things")
     argument, factor = arguments[0], first.factor
-    body = _body(law.basis, weights, (argument,))
+    body = _body(law.basis, (argument,))
     if factor.kind == "sign":
         width = f"{factor.width:.9g}"
         lines = [f"sign = smooth_sign(velocity, {width})", f"factor, factor_slope = sign, (1.0 - sign * sign) / {width}"]
@@ -94,7 +108,7 @@ def _joint_torque(law: Law, weights: FloatArray, recordings: Sequence[str], take
         lines = [f"factor, factor_slope = {value}, {1.0 if value == 'velocity' else 0.0}"]
     slope = "factor_slope * size" + (" + factor * slope" if argument == "velocity" else "")
     lines += [*body.lines, *(body.slope if argument == "velocity" else ()), f"return factor * size, -({slope})"]
-    parts = _Parts.of(law, axis, body, taken)
+    parts, found = _Parts.of(law, axis, body, taken), parameters_of(law.basis, weights)
     imports = ["from pcw_description.compiled import compiled, compiled_joint_torque" if body.helper else
                "from pcw_description.compiled import compiled_joint_torque"]  # fmt: skip
     if factor.kind == "sign":
@@ -111,9 +125,9 @@ def _joint_torque(law: Law, weights: FloatArray, recordings: Sequence[str], take
     ]
     target = ("axis",) if bench else tuple(site.partition("/")[2] for site in law.sites)
     source = parts.source(
-        imports, body, kernel, "JointTorqueEffect", "caster", axis, "torque=torque", recordings, ("joint_states",)
+        imports, body, found, kernel, "JointTorqueEffect", "caster", axis, "torque=torque", recordings, ("joint_states",)
     )
-    return GeneratedEffect(parts.name, target, body.parameters, source)
+    return GeneratedEffect(parts.name, target, found, source)
 
 
 def _own(axis: str, caster: str) -> dict[str, str]:
@@ -146,7 +160,7 @@ def _chassis_force(law: Law, weights: FloatArray, recordings: Sequence[str], tak
     for place in law.places:
         if place.arguments != arguments or any(len(a) > 1 or a[0][0] not in CHASSIS for a in arguments):
             raise NoSuchKernelError("it depends on what the kernel of a force on the chassis does not see")
-    body = _body(law.basis, weights, tuple(CHASSIS[a[0][0]] for a in arguments))
+    body = _body(law.basis, tuple(CHASSIS[a[0][0]] for a in arguments))
     lines = list(body.lines)
     for place in law.places:
         sign = "-" if place.weight < 0 else "+"
@@ -154,7 +168,7 @@ def _chassis_force(law: Law, weights: FloatArray, recordings: Sequence[str], tak
     text = "\n".join([*lines, *body.helper])
     inputs = sorted({name for name in ("FORCE_TIME", "POSE_X", "POSE_Y", "POSE_YAW", "TWIST_X", "TWIST_Y", "TWIST_YAW")
                      if name in text})  # fmt: skip
-    parts = _Parts.of(law, "chassis", body, taken)
+    parts, found = _Parts.of(law, "chassis", body, taken), parameters_of(law.basis, weights)
     imports = [
         f"from pcw_description.compiled import {'compiled, ' if body.helper else ''}compiled_array_kernel",
         "from pcw_description.effects.effect import EffectParameter",
@@ -167,10 +181,10 @@ def _chassis_force(law: Law, weights: FloatArray, recordings: Sequence[str], tak
         *(f"    {line}" for line in lines),
     ]
     source = parts.source(
-        imports, body, kernel, "ChassisForceEffect", "chassis", "chassis", "wrench=wrench", recordings,
+        imports, body, found, kernel, "ChassisForceEffect", "chassis", "chassis", "wrench=wrench", recordings,
         ("joint_states", "ground_truth/odom"),
     )
-    return GeneratedEffect(parts.name, ("chassis",), body.parameters, source)
+    return GeneratedEffect(parts.name, ("chassis",), found, source)
 
 
 def _chassis_factor(factor: Factor) -> str:
@@ -192,54 +206,60 @@ class _Body:
 
     Attributes:
         helper: lines before the kernel; lines: of the kernel, which set `size`; slope: those that set `slope`.
-        parameters: what it is proportional to, as found; formula: in short.
+        formula: in short.
     """
 
     helper: tuple[str, ...]
     lines: tuple[str, ...]
     slope: tuple[str, ...]
-    parameters: Mapping[str, float]
     formula: str
 
 
-def _body(basis: Basis, weights: FloatArray, arguments: tuple[str, ...]) -> _Body:
+def parameters_of(basis: Basis, weights: FloatArray) -> dict[str, float]:
+    """Return the numbers of the effect that holds a law with weights (K,): gains of a closed form, or a curve at its knots."""
     if isinstance(basis, ClosedForm):
-        return _closed(basis, weights, arguments[0])
+        return {f"gain_{k}": float(weight) for k, weight in enumerate(weights)}
+    values = basis.values_at_knots(weights)
+    values = np.append(values, weights[len(values) :])  # the sign of a "speed"
+    return {SCALE: 1.0} | {f"value_{k}": float(value) for k, value in enumerate(values)}
+
+
+def _body(basis: Basis, arguments: tuple[str, ...]) -> _Body:
+    if isinstance(basis, ClosedForm):
+        return _closed(basis, arguments[0])
     if len(arguments) == 2:
-        return _map_of_two(basis, weights, arguments)
+        return _map_of_two(basis, arguments)
     if basis.kind == "periodic":
         raise AssertionError("a Fourier series is a closed form")
     knots = basis.knots[0]
     helper = (
-        f"KNOTS = np.array({_numbers(knots)})", f"VALUES = np.array({_numbers(basis.values_at_knots(weights))})", "", "",
+        f"KNOTS = np.array({_numbers(knots)})", "", "",
         "@compiled",
-        "def curve(z):  # type: ignore[no-untyped-def]",
-        '    """Return the curve at z and its slope, constant beyond its ends."""',
+        "def curve(z, values):  # type: ignore[no-untyped-def]",
+        '    """Return the curve at z, through `values` at the knots, and its slope; constant beyond its ends."""',
         "    if z <= KNOTS[0]:",
-        "        return VALUES[0], 0.0",
+        "        return values[0], 0.0",
         "    for k in range(1, len(KNOTS)):",
         "        if z < KNOTS[k]:",
-        "            slope = (VALUES[k] - VALUES[k - 1]) / (KNOTS[k] - KNOTS[k - 1])",
-        "            return VALUES[k - 1] + slope * (z - KNOTS[k - 1]), slope",
-        "    return VALUES[-1], 0.0",
+        "            slope = (values[k] - values[k - 1]) / (KNOTS[k] - KNOTS[k - 1])",
+        "            return values[k - 1] + slope * (z - KNOTS[k - 1]), slope",
+        "    return values[len(KNOTS) - 1], 0.0",
     )  # fmt: skip
-    lines = [f"size, slope = curve({arguments[0]})"]
+    lines = [f"size, slope = curve({arguments[0]}, parameters[1:])"]
     if basis.kind == "speed":
         lines += [
             f"sign = tanh({arguments[0]} / {basis.width:.9g})",
-            f"size += {weights[-1]:.9g} * sign",
-            f"slope += {weights[-1]:.9g} * (1.0 - sign * sign) / {basis.width:.9g}",
+            "size += parameters[-1] * sign",
+            f"slope += parameters[-1] * (1.0 - sign * sign) / {basis.width:.9g}",
         ]
     lines.append("size *= parameters[0]")
-    return _Body(helper, tuple(lines), ("slope *= parameters[0]",), {"scale": 1.0}, "scale times a curve")
+    return _Body(helper, tuple(lines), ("slope *= parameters[0]",), "scale times a curve")
 
 
-def _map_of_two(basis: Basis, weights: FloatArray, arguments: tuple[str, ...]) -> _Body:
+def _map_of_two(basis: Basis, arguments: tuple[str, ...]) -> _Body:
     first, second = basis.knots
-    values = basis.values_at_knots(weights).reshape(len(first), len(second))
     helper = (
-        f"KNOTS_1 = np.array({_numbers(first)})", f"KNOTS_2 = np.array({_numbers(second)})",
-        "VALUES = np.array(", "    [", *(f"        {_numbers(row)}," for row in values), "    ]", ")", "", "",
+        f"KNOTS_1 = np.array({_numbers(first)})", f"KNOTS_2 = np.array({_numbers(second)})", "", "",
         "@compiled",
         "def place(z, knots):  # type: ignore[no-untyped-def]",
         '    """Return the knot below z and how far z is on the way to the next, within the map."""',
@@ -250,14 +270,15 @@ def _map_of_two(basis: Basis, weights: FloatArray, arguments: tuple[str, ...]) -
     )  # fmt: skip
     lines = (
         f"i, p = place({arguments[0]}, KNOTS_1)", f"j, q = place({arguments[1]}, KNOTS_2)",
-        "low = (1.0 - q) * VALUES[i, j] + q * VALUES[i, j + 1]",
-        "high = (1.0 - q) * VALUES[i + 1, j] + q * VALUES[i + 1, j + 1]",
+        f"values = parameters[1:].reshape({len(first)}, {len(second)})",
+        "low = (1.0 - q) * values[i, j] + q * values[i, j + 1]",
+        "high = (1.0 - q) * values[i + 1, j] + q * values[i + 1, j + 1]",
         "size = parameters[0] * ((1.0 - p) * low + p * high)",
     )  # fmt: skip
-    return _Body(helper, lines, (), {"scale": 1.0}, "scale times a map")
+    return _Body(helper, lines, (), "scale times a map")
 
 
-def _closed(basis: ClosedForm, weights: FloatArray, argument: str) -> _Body:
+def _closed(basis: ClosedForm, argument: str) -> _Body:
     names = [f"gain_{k}" for k in range(len(basis.atoms))]
     lines, inside = [f"z = {argument}"], ""
     if basis.clipped:
@@ -271,7 +292,7 @@ def _closed(basis: ClosedForm, weights: FloatArray, argument: str) -> _Body:
         name + ("" if atom.shape is ONE else f" {atom.written('z')}") for name, atom in zip(names, basis.atoms, strict=True)
     )
     slope = f"slope = ({' + '.join(slopes) or '0.0'}){inside}"
-    return _Body((), tuple(lines), (slope,), dict(zip(names, map(float, weights), strict=True)), formula)
+    return _Body((), tuple(lines), (slope,), formula)
 
 
 def _times(atom: Atom) -> str:
@@ -321,8 +342,8 @@ class _Parts:
         return cls(name, what, f"{factor.get(first.factor.kind, '')}({body.formula})", unit)
 
     def source(
-        self, imports: Sequence[str], body: _Body, kernel: Sequence[str], kind: str, target_kind: str, axis: str, law: str,
-        recordings: Sequence[str], sensors: tuple[str, ...],
+        self, imports: Sequence[str], body: _Body, found: Mapping[str, float], kernel: Sequence[str], kind: str,
+        target_kind: str, axis: str, law: str, recordings: Sequence[str], sensors: tuple[str, ...],
     ) -> str:
         """Return the whole file."""
         text = "\n".join([*body.helper, *kernel])
@@ -342,28 +363,27 @@ class _Parts:
         if body.helper:
             lines += [*body.helper, ""]
         where = " at {target}" if target_kind == "caster" else ""
-        main = next(iter(body.parameters))
+        main, bound = next(iter(found)), LARGEST_FACTOR * max(1e-6, *map(abs, found.values()))
         lines += [
             "", *kernel, "", "", f"EFFECT = {kind}(",
             f'    name="{self.name}",', f'    target_kind="{target_kind}",', f'    axis="{axis}",',
             f'    summary="{self.what[0].upper() + self.what[1:]}, found by the mismatch analyser.",',
             f'    sentence="{self.what[0].upper() + self.what[1:]}{where}, {main} {{{main}:.3g}}.",',
-            "    parameters=(", *(f"        {line}" for name, value in body.parameters.items()
-                                  for line in self._parameter(name, value)), "    ),",
+            "    parameters=(", *(f"        {line}" for name, value in found.items()
+                                  for line in self._parameter(name, value, bound, SCALE not in found or name == SCALE)),
+            "    ),",
             f"    sensors={_tuple(sensors)},", f"    look_alikes={_tuple(LOOK_ALIKES[axis])},",
             f'    separating_experiment="repeat the manoeuvre with {self.what.rpartition("depends on ")[2]} held still",',
             f"    {law},", ")", "",
         ]  # fmt: skip
         return "\n".join(lines)
 
-    def _parameter(self, name: str, value: float) -> list[str]:
-        bound = max(LARGEST_FACTOR * abs(value), 1e-6)
-        unit = "1" if name == "scale" else self.unit
+    def _parameter(self, name: str, value: float, bound: float, linear: bool) -> list[str]:
+        unit = "1" if name == SCALE else self.unit
         numbers = f"{-bound:.6g}, {bound:.6g}, {value:.9g}, default={value:.9g}"
         return [
             "EffectParameter(",
             f'    "{name}", "{unit}", "as found: {value:.4g}", {numbers},',
-            "    linear=True,",
+            *(["    linear=True,"] if linear else []),
             "),",
         ]
-

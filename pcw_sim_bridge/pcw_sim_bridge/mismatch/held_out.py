@@ -140,14 +140,23 @@ class HeldOut:
 
         The first is the logarithm of the ratio of their predictive densities, log p(held out | fitted): numbers of the
         description that the fitted data leave open are open for both. What the fitted data have moved them by foretells as
-        well as an effect does, however far that is; so what it costs is counted, too.
+        well as an effect does, however far that is; so what it costs is counted, too. But where what the effect does is not
+        in the held-out data, they speak against it however badly the fitted ones do without it: then the first is how much
+        smaller the error is with what it does than with nothing in its place.
         """
         both, alone = self.means(), self.means(index)
         better = self._foretold(self._kept(None)) - self._foretold(self._kept(index))
         better += self._retuning(alone) - self._retuning(both)
         rows = slice(*self.span(index))
+        idle = both.copy()
+        idle[:, rows] = 0.0
         work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
-        return better, 0.5 * float(work)
+        return min(better, self._error(idle) - self._error(both)), 0.5 * float(work)
+
+    def _error(self, means: FloatArray) -> float:
+        """Half the squared error of all folds with numbers (F, k), whitened."""
+        extended = [np.append(-mean, 1.0) for mean in means]
+        return 0.5 * float(sum(x @ gram @ x for x, gram in zip(extended, self.test, strict=True)))
 
     def _retuning(self, means: FloatArray) -> float:
         """Half the squared distance of the description's numbers from nominal, in tolerances."""

@@ -23,9 +23,9 @@ from .evidence_selection import EffectSearch, Selection
 from .law_search import FoundLaw, LawSearch
 from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
-from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem
 from .shape_search import refined_shape
-from .unknown_law import UNKNOWN, Law
+from .unknown_law import Law
 from .whitened_regression import Instance, WhitenedRegression
 
 HAT_KNOTS = 9

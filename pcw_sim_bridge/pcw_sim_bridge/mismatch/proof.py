@@ -7,24 +7,27 @@ not proposed; nor is one with which the simulation follows less well than withou
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from pcw_description.effects.kinds import TransmissionEffect
-from pcw_description.effects.registry import get
+from pcw_description.effects.registry import also_known, get
 
 from .errors import MismatchError
 from .explanation import AMBIGUOUS, Explanation
 from .findings import ChannelProof, FitFinding, LadderFinding, RolloutProof
 from .found_effect import effect_instance
 from .held_out import HeldOut
+from .law_models import LawModels
 from .paired_errors import PairedErrors, blocks_of, gap_closed, interval
 from .regression_problem import FloatArray, IntArray, RegressionProblem
 from .rollout import HORIZONS, MAIN_HORIZON, RAN_AWAY, Windows
 from .subject import Opened, Subject
+from .unknown_law import Law
 from .whitened_regression import Instance
 
 HEALTHY = 3.0  # tolerances
@@ -50,6 +53,7 @@ class Proof:
         finding: errors before and after.
         held_out: what was judged; predicted: what the fits take of its residual (T, C).
         tuned: whether re-tuned numbers go into the patch beside the effects.
+        laws: those outside the library that are part of the patch.
         dropped: ladder lines of the effects that do not help.
         notes: what a reader has to know of the proof.
     """
@@ -59,6 +63,7 @@ class Proof:
     held_out: HeldOut
     predicted: FloatArray
     tuned: bool
+    laws: tuple[Law, ...]
     dropped: tuple[LadderFinding, ...]
     notes: tuple[str, ...]
 
@@ -114,6 +119,7 @@ class Prover:
         self.before = None if self.windows is None else subject.rollout(self.windows)
         # Whether numbers of the description that were re-tuned go into the patch, too.
         self.tuned = True
+        self.laws: LawModels
 
     def prove(self, explanation: Explanation) -> Proof:
         """Drop what does not help, and hold the rest against the data.
@@ -123,7 +129,9 @@ class Prover:
         """
         dropped: list[LadderFinding] = []
         notes: list[str] = []
+        refused: set[Instance] = set()
         while True:
+            self.laws = LawModels(explanation, refused)
             held_out = self._held_out(explanation)
             after = None
             useless = self._useless(explanation, held_out)
@@ -133,11 +141,14 @@ class Prover:
             if useless is None:
                 break
             index, reason = useless
-            label, nats = explanation.search.label(held_out.instances[index]), held_out.help_of(index)[0]
+            label, nats = self._label(explanation, held_out.instances[index]), held_out.help_of(index)[0]
             dropped.append(LadderFinding(f"drop {label}", nats, nats, f"fitted but did not help held out: {reason}"))
             notes.append(f"{label} was fitted but did not help held out: {reason}. It is not proposed.")
             kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
-            explanation = self.reduce(explanation, kept)
+            if held_out.instances[index] in self.laws.laws:  # what was fitted has it all the same
+                refused.add(held_out.instances[index])
+            else:
+                explanation = self.reduce(explanation, kept)
         predicted = held_out.problem.residual - held_out.problem.nominal_residual
         if self._is_patched(explanation):
             means = held_out.means()
@@ -154,7 +165,8 @@ class Prover:
                 )
         notes += self._remarks(explanation, held_out, after)
         finding = self._finding(explanation, held_out, predicted, after)
-        return Proof(explanation, finding, held_out, predicted, self.tuned, tuple(dropped), tuple(notes))
+        laws = tuple(self.laws.laws.values())
+        return Proof(explanation, finding, held_out, predicted, self.tuned, laws, tuple(dropped), tuple(notes))
 
     def _simulates_worse(self, explanation: Explanation, after: FloatArray | None) -> bool:
         """Whether the patched description is followed less well than the nominal one, all signals together."""
@@ -166,7 +178,10 @@ class Prover:
 
     def _is_patched(self, explanation: Explanation) -> bool:
         """Whether there is anything beside which numbers of the description are re-tuned."""
-        return bool(explanation.named) or self.besides
+        return bool(explanation.named or self.laws.laws) or self.besides
+
+    def _label(self, explanation: Explanation, instance: Instance) -> str:
+        return self.laws.name(instance) if instance in self.laws.laws else explanation.search.label(instance)
 
     def _numbers(self, explanation: Explanation) -> Mapping[str, float]:
         """Numbers of the description that go into the patch."""
@@ -188,17 +203,18 @@ class Prover:
         problem, selection = explanation.search.problem, explanation.selection
         events = {named.instance for named in explanation.named if is_event(named.term.effect)}
         lasting = [instance for instance in selection.fit.instances if instance not in events]
-        named = {entry.instance for entry in explanation.named}
-        proposed = [index for index, instance in enumerate(lasting) if instance in named]
+        modelled = {*(entry.instance for entry in explanation.named), *self.laws.laws}
+        proposed = [index for index, instance in enumerate(lasting) if instance in modelled]
         if self.other is not None:
-            names = [[c.name for c in p.channels] for p in (problem, self.other)]
+            other = self.laws.in_problem(self.other)
+            names = [[c.name for c in p.channels] for p in (problem, other)]
             if names[0] != names[1]:
                 differ = ", ".join(sorted(set(names[0]) ^ set(names[1])))
                 raise MismatchError(
                     f"channels {differ} are only in the fitted or only in the held-out recordings; allowed: recordings with "
                     "the same sensors in one analysis"
                 )
-            return HeldOut.recordings(problem, lasting, proposed, selection, self.other)
+            return HeldOut.recordings(problem, lasting, proposed, selection, other)
         busy = _busy(explanation)
         quiet = dataclasses.replace(problem, valid=problem.valid & ~busy[:, None]) if busy.any() else problem
         return HeldOut.manoeuvres(quiet, lasting, proposed, selection)
@@ -237,8 +253,7 @@ class Prover:
     ) -> tuple[int, str] | None:
         """An effect with which the simulation follows less well than with the others and the numbers re-tuned to them."""
         windows = self._quiet_windows(explanation)
-        terms = explanation.search.problem.terms
-        moving = [k for k in held_out.proposed if moves_the_robot(terms[held_out.instances[k].term].effect)]
+        moving = [k for k in held_out.proposed if self._simulation_tells(explanation, held_out.instances[k])]
         if windows is None or self.before is None or after is None or not moving:
             return None
 
@@ -258,6 +273,11 @@ class Prover:
         worst, index = max(harms, default=(0.0, 0))
         return (index, "the simulation follows less well with it") if worst > 0.0 else None
 
+    def _simulation_tells(self, explanation: Explanation, instance: Instance) -> bool:
+        if instance in self.laws.laws:
+            return instance not in self.laws.without_kernel
+        return moves_the_robot(explanation.search.problem.terms[instance.term].effect)
+
     def _rollout(self, explanation: Explanation, held_out: HeldOut, without: int | None = None) -> FloatArray | None:
         """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""
         if self.windows is None or self.before is None:
@@ -270,10 +290,11 @@ class Prover:
         for number, mean in enumerate(held_out.means(without)):
             own = fold == number
             if own.any():
-                model = self._patched(explanation.search.problem, held_out, mean, retuned, without)
-                after[own] = model.rollout(self.windows.take(own))
+                with self._patched(explanation.search.problem, held_out, mean, retuned, without) as model:
+                    after[own] = model.rollout(self.windows.take(own))
         return after
 
+    @contextlib.contextmanager
     def _patched(
         self,
         problem: RegressionProblem,
@@ -281,14 +302,19 @@ class Prover:
         mean: FloatArray,
         retuned: Mapping[str, float],
         without: int | None,
-    ) -> Subject:
-        """The description with the effects and numbers that one fold found."""
+    ) -> Iterator[Subject]:
+        """The description with the effects, laws and numbers of one fold; simulators know the laws as long as it is used."""
         effects = []
         for index in held_out.proposed:
             if index == without:
                 continue
             instance = held_out.instances[index]
-            term, values = problem.terms[instance.term], mean[slice(*held_out.span(index))]
+            values = mean[slice(*held_out.span(index))]
+            if instance in self.laws.laws:
+                law = self.laws.simulated(instance, values)
+                effects += [law] if law is not None else []
+                continue
+            term = problem.terms[instance.term]
             parameters = [term.parameters[k] for k in instance.active]
             found = {p.name: p.value(float(value)) for p, value in zip(parameters, values, strict=True) if not p.hidden}
             effects.append(effect_instance(term.effect, term.target, dict(instance.shape) | found, term.axis))
@@ -299,7 +325,8 @@ class Prover:
             for n, change in zip(problem.nuisances, mean, strict=False)
             if n.name in retuned
         }
-        return self.subject.patched(effects, numbers)
+        with also_known(self.laws.effects):
+            yield self.subject.patched(effects, numbers)
 
     # -- what is said -----------------------------------------------------------------------------------------------
 
@@ -312,10 +339,12 @@ class Prover:
             )
         for index in held_out.proposed:
             if held_out.help_of(index)[1] <= AT_WORK:
-                label = explanation.search.label(held_out.instances[index])
+                label = self._label(explanation, held_out.instances[index])
                 remarks.append(f"{label} was not at work in what was held out: nothing there speaks for it or against it.")
         for name in dict.fromkeys(n.term.effect for n in explanation.named if is_event(n.term.effect)):
             remarks.append(f"{name} comes once, from outside: the time in which it acts is left out of the proof.")
+        for instance, reason in self.laws.without_kernel.items():
+            remarks.append(f"The simulation is without {self.laws.name(instance)}: {reason}.")
         if self.windows is not None and after is not None:
             away = _ran_away(self.windows, after)
             if away.any():
@@ -379,9 +408,10 @@ class Prover:
         if windows is None or self.before is None or after is None:
             return (), None
         retuned = self._numbers(explanation)
-        model = self._patched(explanation.search.problem, held_out, held_out.means().mean(axis=0), retuned, None)
-        right = model if self._is_patched(explanation) else self.subject
-        noise = windows.relative(right.rollout_floor(windows, self.rng))
+        means = held_out.means().mean(axis=0)
+        with self._patched(explanation.search.problem, held_out, means, retuned, None) as model:
+            right = model if self._is_patched(explanation) else self.subject
+            noise = windows.relative(right.rollout_floor(windows, self.rng))
         counts = np.maximum(np.isfinite(noise).sum(axis=0), 1)
         floors = np.nansum(noise, axis=0) / counts
         found, gap = [], None

@@ -30,6 +30,8 @@ CURVED_FROM = 0.01
 WEAKER, POWERS = 0.8, (0.5, 3.0)
 PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
+UNKNOWN = "unknown"  # reserved in the vocabulary for what no entry explains
+
 Shape = Mapping[str, float]  # values of the shaping parameters of one candidate
 
 
@@ -166,7 +168,8 @@ class Term:
         """Short label for logs and tables."""
         place = f"{self.axis} of " if self.axis else ""
         occasion = "" if self.recording is None else f" in recording {self.recording + 1}"
-        return f"{self.effect}/{place}{'+'.join(self.target)}{occasion}"
+        law = f" by {', '.join(self.arguments)}" if self.effect == UNKNOWN else ""
+        return f"{self.effect}/{place}{'+'.join(self.target)}{law}{occasion}"
 
     def base_indices(self) -> tuple[int, ...]:
         """Positions of the parameters that are not refinements."""

@@ -21,6 +21,8 @@ import jinja2
 import numpy as np
 import yaml
 
+from pcw_description.effects.registry import PATH_VARIABLE
+
 from .errors import MismatchError
 from .findings import VERDICTS, ChannelProof, Findings, ParameterFinding, RetunedFinding, RolloutProof
 from .report_drawing import SUPERSCRIPTS, Drawing, pretty_unit
@@ -28,6 +30,7 @@ from .report_figures import TraceFigures, draw_traces, time_origin
 from .report_maps import draw_maps
 
 HTML, JSON, PATCHED, FIGURES, EFFECTS = "report.html", "report.json", "robot_patched.yaml", "figures", "effects"
+WITH_LAWS = "robot_with_laws.yaml"  # in the folder of effects
 TEMPLATE = "report.html.j2"
 BEYOND_TOLERANCE = 3.0  # tolerances; a number that moved further is not healthy re-tuning
 # Where report.json may say null instead of a number that does not exist (NaN); anywhere else NaN is an error.
@@ -148,14 +151,21 @@ def _appearing_folder(out: Path, force: bool) -> Iterator[Path]:
         raise
 
 
-def write_report(findings: Findings, patched: Mapping[str, Any] | None, out: Path, force: bool = False) -> Path:
-    """Write report.html, report.json, robot_patched.yaml and figures/ to a folder, all of them or nothing.
+def write_report(
+    findings: Findings,
+    patched: Mapping[str, Any] | None,
+    out: Path,
+    force: bool = False,
+    with_laws: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write report.html, report.json, robot_patched.yaml, figures/ and effects/ to a folder, all of them or nothing.
 
     Args:
         findings: what the analysis says.
         patched: the description with what was found, or the nominal one where nothing was; None leaves the file out.
         out: the folder; made, with its parents, if need be.
         force: replace an earlier report there.
+        with_laws: the description with the effects that were generated, too; None leaves the file out.
 
     Returns:
         The path of report.html.
@@ -175,6 +185,8 @@ def write_report(findings: Findings, patched: Mapping[str, Any] | None, out: Pat
                 if leftover.effect is not None:
                     (folder / EFFECTS).mkdir(exist_ok=True)
                     _write(folder / EFFECTS / f"{leftover.effect.name}.py", leftover.effect.source)
+            if with_laws is not None:
+                _write(folder / EFFECTS / WITH_LAWS, f"# Where {PATH_VARIABLE} names this folder.\n{_yaml(with_laws)}")
             figures = draw_traces(findings)
             maps = None if findings.residual_map is None else draw_maps(findings.residual_map)
             (folder / FIGURES).mkdir()

@@ -18,9 +18,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from .regression_problem import FloatArray, LinearParameter, RegressionProblem, Sites, Term
+from .regression_problem import UNKNOWN, FloatArray, LinearParameter, RegressionProblem, Sites, Term
 
-UNKNOWN = "unknown"  # reserved in the vocabulary for what no entry explains
 KNOTS = 8
 FLOOR_KNOTS = 5  # along each side of a map
 HARMONICS = 3

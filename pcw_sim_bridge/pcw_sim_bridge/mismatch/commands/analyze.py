@@ -71,7 +71,9 @@ def run(options: argparse.Namespace) -> int:
     subject = load_subject(options.robot)
     analysis = analyse(subject, options.recordings, options.holdout, topics, options.seed, progress)
     progress("writing the report")
-    report = write_report(analysis.findings, analysis.patched.mapping(), options.out, options.force)
+    report = write_report(
+        analysis.findings, analysis.patched.mapping(), options.out, options.force, analysis.with_laws
+    )
     print(report)
     for line in analysis.findings.summary():
         print(line)

@@ -1,0 +1,78 @@
+"""Laws outside the library as models: where they stand in a fit, in the problem of other recordings, and in a simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Container, Mapping
+
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.effect import Effect
+from pcw_description.effects.registry import all_effects
+
+from .explanation import Explanation
+from .generated_effect import GeneratedEffect, NoSuchKernelError, generate, parameters_of
+from .regression_problem import UNKNOWN, FloatArray, RegressionProblem
+from .unknown_law import Law
+from .whitened_regression import Instance
+
+
+@dataclasses.dataclass(frozen=True)
+class _Simulated:
+    """A law as an effect that simulators know for a while."""
+
+    made: GeneratedEffect
+    effect: Effect
+
+
+class LawModels:
+    """The laws that the fit of an explanation holds and that are to be modelled, by instance.
+
+    Attributes:
+        laws: every law.
+        without_kernel: why simulators cannot have a law, for those that they cannot.
+    """
+
+    def __init__(self, explanation: Explanation, refused: Container[Instance] = ()) -> None:
+        """Find the laws but for those refused, and make each an effect if the kernel of one can hold it."""
+        self.laws: dict[Instance, Law] = {}
+        self.without_kernel: dict[Instance, str] = {}
+        self._simulated: dict[Instance, _Simulated] = {}
+        terms = explanation.search.problem.terms
+        for instance in explanation.selection.fit.instances:
+            term = terms[instance.term]
+            is_law = term.effect == UNKNOWN and instance not in refused
+            for left in explanation.leftovers if is_law else ():
+                if left.law is None or (left.law.sites, left.law.depends_on) != (term.target, term.arguments):
+                    continue
+                self.laws[instance] = left.law
+                taken = [*all_effects(), *(known.made.name for known in self._simulated.values())]
+                try:
+                    made = generate(left.law, left.weights, (), taken)
+                    self._simulated[instance] = _Simulated(made, made.effect())
+                except NoSuchKernelError as error:
+                    self.without_kernel[instance] = str(error)
+
+    @property
+    def effects(self) -> list[Effect]:
+        """The laws that simulators can have."""
+        return [known.effect for known in self._simulated.values()]
+
+    def name(self, instance: Instance) -> str:
+        """Say a law in a few words."""
+        law = self.laws[instance]
+        return f"the dependence of {' and '.join(law.sites)} on {', '.join(law.depends_on)}"
+
+    def in_problem(self, other: RegressionProblem) -> RegressionProblem:
+        """The problem of other recordings with the laws as further terms; as it is where it has no sites."""
+        if other.sites is None or not self.laws:
+            return other
+        names = set(other.sites.variables)
+        return other.with_terms([law.term(other) for law in self.laws.values() if set(law.depends_on) <= names])
+
+    def simulated(self, instance: Instance, weights: FloatArray) -> EffectInstance | None:
+        """A law with weights (K,) as it stands under `physics:`; None where simulators cannot have it."""
+        if instance not in self._simulated:
+            return None
+        made = self._simulated[instance].made
+        numbers: Mapping[str, float] = parameters_of(self.laws[instance].basis, weights)
+        return EffectInstance(made.name, made.target, dict(numbers), None)
