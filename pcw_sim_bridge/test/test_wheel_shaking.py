@@ -11,6 +11,7 @@ ROBOT = load_robot("thesis")
 RATE, SAMPLES = 500.0, 4000
 DRIVE_INERTIA = ROBOT.casters[0].rotors.drive + ROBOT.casters[0].wheel.inertia_axle
 LOW_PASS = SignalFilter(RATE, 15.0)
+NO_SPEED = np.full((SAMPLES, ROBOT.n, 2), np.nan)
 
 
 def rolling() -> tuple[np.ndarray, np.ndarray]:
@@ -28,7 +29,7 @@ def test_a_wheel_that_shakes_is_found_up_to_half_the_rate(frequency):
     phase = 2.0 * np.pi * frequency * np.arange(SAMPLES) / RATE + 0.3
     torque[:, 2, 0] += DRIVE_INERTIA * swing * (2.0 * np.pi * frequency) * np.cos(phase)
     position[:, 2, 0] += swing / (2.0 * np.pi * frequency) * -np.cos(phase)
-    found = wheel_shaking(ROBOT, position, torque, LOW_PASS)
+    found = wheel_shaking(ROBOT, position, NO_SPEED, torque, LOW_PASS)
     # From sample to sample a sine of the frequency f moves by 2 sin(pi f / rate) of its amplitude.
     seen = 2.0 * np.sin(np.pi * frequency / RATE) * swing / (2.0 * np.pi * frequency) * RATE
     by_torque = np.pi * frequency / RATE / np.sin(np.pi * frequency / RATE) * swing
@@ -37,18 +38,36 @@ def test_a_wheel_that_shakes_is_found_up_to_half_the_rate(frequency):
     assert found.frequency == pytest.approx(frequency, abs=1.0)
 
 
+def test_a_torque_that_changes_its_sign_with_every_sample_is_found_by_the_speeds():
+    """The wheel is where it was after two samples: in its angles there is a small part of how it shakes."""
+    position, torque = rolling()
+    sign = (-1.0) ** np.arange(SAMPLES)
+    torque[:, 2, 0] += 1.4 * DRIVE_INERTIA * RATE * 2.0 * sign
+    velocity = np.gradient(position, 1.0 / RATE, axis=0)
+    velocity[:, 2, 0] += 1.4 * sign
+    position[:, 2, 0] += 1e-4 * sign
+    middle = slice(SAMPLES // 4, -SAMPLES // 4)
+    by_angles = wheel_shaking(ROBOT, position, NO_SPEED, torque, LOW_PASS)
+    found = wheel_shaking(ROBOT, position, velocity, torque, LOW_PASS)
+    assert np.median(found.speed[middle]) == pytest.approx(1.4 * np.sqrt(2.0) * ROBOT.wheel_radius[2], rel=0.1)
+    assert found.frequency == pytest.approx(RATE / 2.0, abs=1.0)
+    assert np.median(by_angles.speed[middle]) < 0.1 * np.median(found.speed[middle])
+
+
 def test_noise_of_one_sensor_is_no_shaking():
-    """Coarse encoders alone, and noisy torques alone, each large enough to pass for 0.1 m/s."""
+    """Coarse encoders alone, noisy speeds and noisy torques alone, each large enough to pass for 0.1 m/s."""
     position, torque = rolling()
     rng = np.random.default_rng(0)
     coarse = position + rng.uniform(-4e-3, 4e-3, position.shape)
     noisy = torque + 20.0 * DRIVE_INERTIA * rng.standard_normal(torque.shape)
-    for one, other in ((coarse, torque), (position, noisy)):
-        assert np.quantile(wheel_shaking(ROBOT, one, other, LOW_PASS).speed, 0.99) < 0.005
+    speed = np.gradient(position, 1.0 / RATE, axis=0)
+    rough = speed + 1.5 * rng.standard_normal(speed.shape)
+    for one, own, other in ((coarse, NO_SPEED, torque), (position, rough, torque), (position, speed, noisy)):
+        assert np.quantile(wheel_shaking(ROBOT, one, own, other, LOW_PASS).speed, 0.99) < 0.005
 
 
 def test_nothing_is_said_without_torques():
     position, torque = rolling()
-    found = wheel_shaking(ROBOT, position, np.full_like(torque, np.nan), LOW_PASS)
+    found = wheel_shaking(ROBOT, position, NO_SPEED, np.full_like(torque, np.nan), LOW_PASS)
     assert not found.speed.any()
     assert found.frequency == 0.0

@@ -99,7 +99,9 @@ def read_motions(
             )
     quiet = quiet_torque(robot, recording)
     quiet = torque if quiet is None else quiet
-    signals = np.concatenate([signals, imu, _tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n)], axis=1)
+    speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
+    others = [_tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n)]
+    signals = np.concatenate([signals, imu, *others], axis=1)
     largest_gap = max(LARGEST_GAP, LARGEST_GAP_PERIODS * float(np.median(np.diff(joints.stamp))))
     rate, pieces = uniform_segments(joints.stamp, signals, largest_gap)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
@@ -119,8 +121,9 @@ def read_motions(
             others = slice(4 * n, 4 * n + 6)
             sensed = np.where(np.isfinite(block[:, others]), smooth[:, others], np.nan)
             pose = sensed[:, 3:]
+            measured_torque = block[:, 2 * n : 4 * n].reshape(-1, n, 2)
             shaking = wheel_shaking(
-                robot, block[:, : 2 * n].reshape(-1, n, 2), block[:, 2 * n : 4 * n].reshape(-1, n, 2), wide
+                robot, block[:, : 2 * n].reshape(-1, n, 2), block[:, -2 * n :].reshape(-1, n, 2), measured_torque, wide
             )
             motions.append(
                 RobotMotion(
@@ -134,7 +137,7 @@ def read_motions(
                     acceleration=derivative(velocity, rate)[keep].copy(),
                     torque=torque[keep].copy(),
                     torque_rate=derivative(torque, rate)[keep].copy(),
-                    quiet_torque=smooth[keep, 4 * n + 6 :].reshape(-1, n, 2),
+                    quiet_torque=smooth[keep, 4 * n + 6 : 6 * n + 6].reshape(-1, n, 2),
                     imu=sensed[keep, :3],
                     pose=base_pose(robot, pose[keep]),
                     tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),

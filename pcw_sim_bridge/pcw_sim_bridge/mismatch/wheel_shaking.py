@@ -2,8 +2,9 @@
 
 Such a wheel slips to and fro, and what its tyre carries on average has little to do with its average slip: filtered, the
 recording looks quiet and follows no model. The noise of an encoder looks the same in its angles, and a noisy measurement of
-torque in the torques; what shakes a wheel is in both. So the speed is taken that the angles show, or that the torques give
-the rotors and wheels by themselves, whichever is less.
+torque in the torques; what shakes a wheel is in both. So the speed is taken that the angles or the drive's own speeds show, or
+that the torques give the rotors and wheels by themselves, whichever is less. A torque that changes its sign with every sample
+brings the wheel back to where it was: its angles hardly show that, its speeds do.
 """
 
 from __future__ import annotations
@@ -34,12 +35,15 @@ class Shaking:
     frequency: float
 
 
-def wheel_shaking(robot: RobotDescription, position: FloatArray, torque: FloatArray, low_pass: SignalFilter) -> Shaking:
+def wheel_shaking(
+    robot: RobotDescription, position: FloatArray, velocity: FloatArray, torque: FloatArray, low_pass: SignalFilter
+) -> Shaking:
     """Return how wheels shake.
 
     Args:
         robot: its radii, offsets and inertias.
-        position, torque: of the joints as measured, on a regular grid (T, n, 2) [rad, N m]. NaN torques: nothing is said.
+        position, velocity, torque: of the joints as measured, on a regular grid (T, n, 2) [rad, rad/s, N m]. Velocities may be
+            NaN; with NaN torques nothing is said.
         low_pass: what is faster than it lets pass is looked at, amplitudes over its period.
     """
     rate, count = low_pass.rate, len(position)
@@ -53,10 +57,12 @@ def wheel_shaking(robot: RobotDescription, position: FloatArray, torque: FloatAr
 
     # From sample to sample: a central difference sees nothing of what changes its sign with every sample.
     by_angle = fast(np.diff(position, axis=0, prepend=position[:1]) * rate)
+    by_speed = fast(velocity) if np.isfinite(velocity).all() else by_angle
     by_torque = fast(np.cumsum(fast(torque), axis=0) / (rate * np.maximum(inertia, 1e-9)))
-    squares = [np.maximum(low_pass.smooth(values**2), 0.0) for values in (by_angle, by_torque)]
-    contact = reach * np.sqrt(2.0 * np.minimum(*squares))
+    angle, own, given = (np.maximum(low_pass.smooth(values**2), 0.0) for values in (by_angle, by_speed, by_torque))
+    contact = reach * np.sqrt(2.0 * np.minimum(np.maximum(angle, own), given))
     speed = np.hypot(contact[:, :, DRIVE], contact[:, :, STEER]).max(axis=1)
     worst = int(np.argmax(np.mean(contact**2, axis=0)))
-    frequencies, density = signal.welch(by_angle.reshape(count, -1)[:, worst], rate, nperseg=min(SPECTRUM_SAMPLES, count))
+    seen = (by_speed if np.sum(own) > np.sum(angle) else by_angle).reshape(count, -1)[:, worst]
+    frequencies, density = signal.welch(seen, rate, nperseg=min(SPECTRUM_SAMPLES, count))
     return Shaking(speed, float(frequencies[int(np.argmax(density))]))
