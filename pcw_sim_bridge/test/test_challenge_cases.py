@@ -188,6 +188,18 @@ def test_size_is_in_proportion_and_nothing_is_no_size(channels: HealthyChannels)
     assert low < 0.0 < high
 
 
+def test_what_the_description_with_the_effect_does_not_explain_is_no_evidence(channels: HealthyChannels) -> None:
+    """Two runs differ also in where the model is wrong: only what goes with the effect in the description counts."""
+    effect = effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": 0.02})
+    other = effect_instance("aerodynamic_drag", ("chassis",), {"coefficient": 1e-3})
+    runs = [simulate(world().quiet(), RUN, [effect])]
+    plain, told, wrong = (channels.size(runs, effects).evidence for effects in ((), [effect], [other]))
+    assert plain > 18.0
+    assert told == pytest.approx(plain, rel=0.1)
+    assert wrong < 0.05 * plain
+    assert channels.evidence(THESIS, runs, [effect]) == pytest.approx(told, rel=1e-6)
+
+
 def test_what_is_within_tolerance_has_hardly_any_evidence(channels: HealthyChannels) -> None:
     """One deviation of a radius shows in the channels, and re-tuning explains it; fifteen do not pass for healthy."""
     radius = 1e-3 * THESIS.wheel_radius[0]

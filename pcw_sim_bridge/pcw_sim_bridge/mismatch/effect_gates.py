@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .noise_model import channel_deviations
-from .regression_problem import BoolArray, FloatArray, RegressionProblem
+from .regression_problem import BoolArray, FloatArray, RegressionProblem, Term
 from .selection_settings import SelectionSettings
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -16,6 +16,8 @@ ABOVE_BURSTS = 3.0
 # By so much more must effects stand out whose columns hold noise that the residual holds; and by so much more again where they
 # are on all casters alike: what gears that wind up do to all wheels at once, a chassis that pitches on its springs does, too.
 NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
+# Part of what remains that such an effect on some of the casters must do: noise is not at one of them alone.
+NOISY_PART = 0.75
 # An effect that by itself is so many deviations of the model's scale is no wrong scale, though others undo most of it.
 BEYOND_SCALE = 20.0
 
@@ -156,7 +158,10 @@ class EffectGates:
 
         Columns with the residual's own noise explain a part of that noise; an effect is more than all of it.
         """
-        return 1.0 if self.problem.terms[instance.term].noisy else self.settings.smallest_share
+        term = self.problem.terms[instance.term]
+        if not term.noisy:
+            return self.settings.smallest_share
+        return 1.0 if self._on_all_casters(term) else NOISY_PART
 
     def _details(self, instances: Sequence[Instance]) -> FloatArray:
         """What the model itself misjudges (C,), which is no effect: two deviations of its scale, and its slips.
@@ -173,8 +178,11 @@ class EffectGates:
         noisy = [self.problem.terms[instance.term] for instance in instances if self.problem.terms[instance.term].noisy]
         if not noisy:
             return 1.0
-        all_casters = max(len(term.target) for term in self.problem.terms)
-        return NOISY_FACTOR * (COMMON_FACTOR if any(len(term.target) == all_casters > 1 for term in noisy) else 1.0)
+        return NOISY_FACTOR * (COMMON_FACTOR if any(self._on_all_casters(term) for term in noisy) else 1.0)
+
+    def _on_all_casters(self, term: Term) -> bool:
+        """Whether a term is at several casters, and at no fewer than any other."""
+        return len(term.target) == max(len(other.target) for other in self.problem.terms) > 1
 
 
 def _at_work(part: FloatArray) -> BoolArray:

@@ -100,8 +100,8 @@ def read_motions(
     quiet = quiet_torque(robot, recording)
     quiet = torque if quiet is None else quiet
     speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
-    others = [_tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n)]
-    signals = np.concatenate([signals, imu, *others], axis=1)
+    more = [_tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n)]
+    signals = np.concatenate([signals, imu, *more], axis=1)
     largest_gap = max(LARGEST_GAP, LARGEST_GAP_PERIODS * float(np.median(np.diff(joints.stamp))))
     rate, pieces = uniform_segments(joints.stamp, signals, largest_gap)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)

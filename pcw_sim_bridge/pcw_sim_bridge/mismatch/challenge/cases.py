@@ -273,7 +273,8 @@ class _Drawing:
             instances, size = self._sized(group, run, channels)
             if self._order.masking == "retuned":
                 self._retune(size, channels)
-                left = channels.evidence(self._world.nominal, [simulate(self._world.quiet(), run, instances)])
+                runs = [simulate(self._world.quiet(), run, instances)]
+                left = channels.evidence(self._world.nominal, runs, instances)
                 size = self._not_tolerated(dataclasses.replace(size, evidence=left), instances)
             found += [self._entry(instance, size, healthy) for instance in instances]
         return found
@@ -307,7 +308,8 @@ class _Drawing:
                 instances = group(factor)
                 if kept is not None and instances == kept[0]:
                     break  # at its limit
-                size = self._not_tolerated(channels.size([simulate(self._world.quiet(), run, instances)]), instances)
+                runs = [simulate(self._world.quiet(), run, instances)]
+                size = self._not_tolerated(channels.size(runs, instances), instances)
             except PcwError:  # too much for the robot, or for the effect's own range
                 factor *= 0.3
                 continue

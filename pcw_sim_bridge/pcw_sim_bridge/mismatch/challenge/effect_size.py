@@ -4,12 +4,14 @@
 
 The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. An effect may be large
 and yet be no more than re-tuning within tolerances explains; `evidence` says what the run costs more with the effect than
-without it [nats], each re-tuned by itself:
+without it, and than the same run against a description that holds the effect [nats], each re-tuned by itself:
 
-    cost = min over nu of ( sum rho((residual - N nu) / floor) + 1/2 |nu / tolerance|^2 ),
+    cost = min over nu of ( sum rho(W (residual - N nu)) + 1/2 |nu / tolerance|^2 ),
 
-exact where the re-tuning comes out. rho is Huber's loss, since where wheels slip hard a little other motion leaves much else.
-Each run has its own columns: what two runs differ by is no change of one motion, as soon as the effect moves the robot.
+exact where the re-tuning comes out. W whitens the noise of the healthy run: channels share the noise of torques and angles,
+and what looks like it is no evidence. rho is Huber's loss: where wheels slip hard a little other motion leaves much else.
+Each run has its own columns: what two runs differ by is no change of one motion, as soon as the effect moves the robot. What
+the model misjudges on its other way is no evidence, and that the description with the effect does not explain either.
 """
 
 from __future__ import annotations
@@ -20,10 +22,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.kinds import ActuatorEffect, TransmissionEffect
+from pcw_description.effects.registry import all_effects
 from pcw_description.robot_description import STEER, RobotDescription
 
 from ..errors import MismatchError
-from ..noise_model import huber_weights
+from ..noise_model import fit_noise_model, huber_weights
 from ..regression_problem import BoolArray, FloatArray, RegressionProblem
 from ..robot_channels import RobotProblemBuilder
 from .simulated_case import SimulatedRecording
@@ -74,13 +79,14 @@ class HealthyChannels:
         self.problem = builder.build(with_terms=False)
         self._columns = self.problem.nuisance_columns()
         self._deviations = self.problem.nuisance_deviations()
-        self.floor = self._noise_floor()
+        self.floor, noise = self._noise_floor()
+        self._noise = fit_noise_model(noise, self.problem.valid, self.problem.segment)
         self._quiet = _build(nominal, quiet, self._cutoff)
         self._healthy_cost = self._cost(self._quiet)
         self._headings = [_headings(recording) for recording in quiet]
 
-    def size(self, recordings: Sequence[SimulatedRecording]) -> EffectSize:
-        """Return how large an effect is that these runs without noise have and the healthy ones have not.
+    def size(self, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance] = ()) -> EffectSize:
+        """Return how large effects are that these runs without noise have and the healthy ones have not.
 
         Raises:
             MismatchError: with it a caster turns round the other way; what then differs is another motion, and no effect.
@@ -98,19 +104,32 @@ class HealthyChannels:
         relative = _rms(change, rows) / self.floor
         largest = int(np.argmax(relative))
         cost, moved = self._cost(with_effect)
-        healthy_cost, healthy_moved = self._healthy_cost
+        _, healthy_moved = self._healthy_cost
         active = np.any(rows & (np.abs(change) > self.floor), axis=1)
         return EffectSize(
             size=float(relative[largest]),
             channel=problem.channels[largest].name,
-            evidence=max(cost - healthy_cost, 0.0),
+            evidence=max(cost - self._explained(self._nominal, recordings, effects), 0.0),
             region=_regions(problem, active),
             retuned={n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)},
         )
 
-    def evidence(self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording]) -> float:
+    def evidence(
+        self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance] = ()
+    ) -> float:
         """What these runs cost against another description more than the healthy ones against their own [nats]."""
-        return max(self._cost(_build(nominal, recordings, self._cutoff))[0] - self._healthy_cost[0], 0.0)
+        cost, _ = self._cost(_build(nominal, recordings, self._cutoff))
+        return max(cost - self._explained(nominal, recordings, effects), 0.0)
+
+    def _explained(
+        self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance]
+    ) -> float:
+        """What no description explains: the cost of the healthy runs, or of these against one that holds the effects."""
+        healthy, _ = self._healthy_cost
+        if not effects or not all(_in_channels(instance) for instance in effects):
+            return healthy
+        described = dataclasses.replace(nominal, physics=(*nominal.physics, *effects))
+        return max(healthy, self._cost(_build(described, recordings, self._cutoff))[0])
 
     def _change(self, other: RegressionProblem) -> FloatArray:
         """What the residual of another run is more than that of the quiet one (T, C)."""
@@ -124,9 +143,9 @@ class HealthyChannels:
         best, moved = math.inf, np.zeros(len(self._deviations))
         there = problem
         for _ in range(EXACT_ROUNDS):
-            columns = np.where(problem.valid[:, :, None], there.nuisance_columns() / self.floor[:, None], 0.0)
+            columns = self._noise.whiten(there.nuisance_columns(), problem.valid, problem.segment)
             scaled = columns.reshape(-1, len(self._deviations)) * self._deviations
-            target = np.where(problem.valid, there.residual / self.floor, 0.0).ravel()
+            target = self._noise.whiten(there.residual, problem.valid, problem.segment).ravel()
             weights: FloatArray = np.ones_like(target)
             for _ in range(REWEIGHTED):
                 weighted = scaled * weights[:, None]
@@ -140,13 +159,14 @@ class HealthyChannels:
             there = problem.exact_at({n.name: float(v) for n, v in zip(problem.nuisances, moved, strict=True)}, ())
         return best, moved
 
-    def _noise_floor(self) -> FloatArray:
+    def _noise_floor(self) -> tuple[FloatArray, FloatArray]:
+        """Noise floor of every channel (C,), and the noise itself (T, C)."""
         residual, valid = self.problem.residual, self.problem.valid
         floor = np.maximum(_rms(residual, valid), 1e-12)
         for _ in range(4):  # the weights of the re-tuning are the floor that it leaves
             rest, _ = self._retuned(residual, valid, floor)
             floor = np.maximum(_rms(rest, valid), 1e-12)
-        return floor
+        return floor, rest
 
     def _retuned(self, values: FloatArray, rows: BoolArray, floor: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what re-tuning within tolerances leaves of values (T, C), and the re-tuning (K,)."""
@@ -156,6 +176,15 @@ class HealthyChannels:
         solution = np.linalg.solve(scaled.T @ scaled + np.eye(scaled.shape[1]), scaled.T @ wanted)
         moved = self._deviations * solution
         return values - self._columns @ moved, moved
+
+
+def _in_channels(instance: EffectInstance) -> bool:
+    """Whether the channels of a description that holds the effect are exact.
+
+    What comes before the measured torque is not in them; gears that play or give are, to first order; laws are in no library.
+    """
+    effect = all_effects().get(instance.name)
+    return effect is not None and not isinstance(effect, ActuatorEffect | TransmissionEffect)
 
 
 def _headings(recording: SimulatedRecording) -> FloatArray:
