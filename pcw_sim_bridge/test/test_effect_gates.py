@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.effect_gates import BEYOND_SCALE, COMMON_FACTOR, NOISY_FACTOR, EffectGates
+from pcw_sim_bridge.mismatch.effect_gates import BEYOND_SCALE, COMMON_FACTOR, NOISY_FACTOR, NOISY_PART, EffectGates
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
 
 CASTERS = ("a", "b", "c")
@@ -28,7 +28,10 @@ def test_gears_of_all_casters_stand_out_from_what_a_chassis_does_to_all_wheels(n
         "gears of all": SimpleNamespace(target=CASTERS, noisy=True),
     }
     gates = EffectGates(SimpleNamespace(terms=list(terms.values())), SelectionSettings())
-    assert gates._noise_factor([SimpleNamespace(term=list(terms).index(name)) for name in named]) == factor
+    instances = [SimpleNamespace(term=list(terms).index(name)) for name in named]
+    assert gates._noise_factor(instances) == factor
+    least = {"friction": SelectionSettings().smallest_share, "gear of one": NOISY_PART, "gears of all": 1.0}
+    assert [gates._least(instance) for instance in instances] == [least[name] for name in named]
 
 
 @pytest.mark.parametrize(

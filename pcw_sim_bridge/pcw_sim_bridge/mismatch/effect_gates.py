@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .noise_model import channel_deviations
-from .regression_problem import BoolArray, FloatArray, RegressionProblem, Term
+from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -16,7 +16,7 @@ ABOVE_BURSTS = 3.0
 # By so much more must effects stand out whose columns hold noise that the residual holds; and by so much more again where they
 # are on all casters alike: what gears that wind up do to all wheels at once, a chassis that pitches on its springs does, too.
 NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
-# Part of what remains that such an effect on some of the casters must do: noise is not at one of them alone.
+# Part of what remains that such an effect must do that is on some casters; else all of it. Noise is not at one of them alone.
 NOISY_PART = 0.75
 # An effect that by itself is so many deviations of the model's scale is no wrong scale, though others undo most of it.
 BEYOND_SCALE = 20.0
@@ -161,7 +161,7 @@ class EffectGates:
         term = self.problem.terms[instance.term]
         if not term.noisy:
             return self.settings.smallest_share
-        return 1.0 if self._on_all_casters(term) else NOISY_PART
+        return NOISY_PART if len(term.target) < self._most_targets() else 1.0
 
     def _details(self, instances: Sequence[Instance]) -> FloatArray:
         """What the model itself misjudges (C,), which is no effect: two deviations of its scale, and its slips.
@@ -178,11 +178,11 @@ class EffectGates:
         noisy = [self.problem.terms[instance.term] for instance in instances if self.problem.terms[instance.term].noisy]
         if not noisy:
             return 1.0
-        return NOISY_FACTOR * (COMMON_FACTOR if any(self._on_all_casters(term) for term in noisy) else 1.0)
+        return NOISY_FACTOR * (COMMON_FACTOR if any(len(term.target) == self._most_targets() > 1 for term in noisy) else 1.0)
 
-    def _on_all_casters(self, term: Term) -> bool:
-        """Whether a term is at several casters, and at no fewer than any other."""
-        return len(term.target) == max(len(other.target) for other in self.problem.terms) > 1
+    def _most_targets(self) -> int:
+        """At how many casters a term is at most: at all of them."""
+        return max(len(term.target) for term in self.problem.terms)
 
 
 def _at_work(part: FloatArray) -> BoolArray:
