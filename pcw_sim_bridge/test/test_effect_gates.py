@@ -5,7 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.effect_gates import BEYOND_SCALE, COMMON_FACTOR, NOISY_FACTOR, NOISY_PART, EffectGates
+from pcw_sim_bridge.mismatch.effect_gates import (
+    BEYOND_SCALE,
+    COMMON_FACTOR,
+    NOISY_FACTOR,
+    NOISY_PART,
+    EffectGates,
+)
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
 
 CASTERS = ("a", "b", "c")

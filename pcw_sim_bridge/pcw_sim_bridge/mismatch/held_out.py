@@ -18,6 +18,8 @@ from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProbl
 from .whitened_regression import Instance, WhitenedRegression
 
 FOLDS = 4  # parts that manoeuvres are dealt out to in turn
+# Held-out data speak against an effect, whatever the fitted ones say, if its work adds so much to their error [nats].
+CONTRADICTED = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,8 +143,8 @@ class HeldOut:
         The first is the logarithm of the ratio of their predictive densities, log p(held out | fitted): numbers of the
         description that the fitted data leave open are open for both. What the fitted data have moved them by foretells as
         well as an effect does, however far that is; so what it costs is counted, too. But where what the effect does is not
-        in the held-out data, they speak against it however badly the fitted ones do without it: then the first is how much
-        smaller the error is with what it does than with nothing in its place.
+        in the held-out data, they speak against it however badly the fitted ones do without it: then the first is by how much
+        the error is smaller, and so negative, with what it does than with nothing in its place.
         """
         both, alone = self.means(), self.means(index)
         better = self._foretold(self._kept(None)) - self._foretold(self._kept(index))
@@ -151,7 +153,8 @@ class HeldOut:
         idle = both.copy()
         idle[:, rows] = 0.0
         work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
-        return min(better, self._error(idle) - self._error(both)), 0.5 * float(work)
+        smaller = self._error(idle) - self._error(both)
+        return smaller if smaller < -CONTRADICTED else better, 0.5 * float(work)
 
     def _error(self, means: FloatArray) -> float:
         """Half the squared error of all folds with numbers (F, k), whitened."""
