@@ -213,7 +213,7 @@ class RobotProblemBuilder:
         for motion, own in zip(self.motions, self.filters, strict=True):
             centres = np.stack([self.model.wheel_places(motion, i) for i in range(self.robot.n)], axis=1)
             places.append(own.decimate(centres))
-            headings.append(own.decimate(motion.pose[:, 2:] + motion.position[:, :, STEER]))
+            headings.append(own.decimate(motion.pose[:, 2:] + self.numbers.headings(motion.position)))
         return np.concatenate(places), np.concatenate(headings)
 
     def _scale_deviation(self) -> float:
@@ -259,7 +259,7 @@ class RobotProblemBuilder:
         """What a leftover may depend on, one array per motion."""
         found: dict[str, list[FloatArray]] = {}
         for motion, normal in zip(self.motions, differences.normal, strict=True):
-            twist, _ = twists(self.numbers, motion.position[:, :, STEER], motion.velocity)
+            twist, _ = twists(self.numbers, self.numbers.headings(motion.position), motion.velocity)
             signals = {"time": motion.time, "speed": np.hypot(twist[:, 0], twist[:, 1])}
             signals |= {name: twist[:, k] for k, name in enumerate(("v_x", "v_y", "omega"))}
             signals |= {name: motion.pose[:, k] for k, name in enumerate(("x", "y", "yaw"))}
@@ -317,7 +317,7 @@ def allowed_slip(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
 
 def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -> BoolArray:
     """Return the rows (T,) of a motion in which wheels slide, shake, or use so much friction that their slip is open."""
-    twist, contradiction = twists(numbers, motion.position[:, :, STEER], motion.velocity)
+    twist, contradiction = twists(numbers, numbers.headings(motion.position), motion.velocity)
     allowed = allowed_slip(numbers, twist)
     if layout.redundant:
         bad: BoolArray = np.max(np.linalg.norm(contradiction, axis=2), axis=1) > allowed

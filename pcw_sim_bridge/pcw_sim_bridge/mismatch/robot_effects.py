@@ -82,7 +82,7 @@ def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[Rob
         if np.isfinite(motion.pose).all():
             found.append(motion)
             continue
-        twist = twists(numbers, motion.position[:, :, STEER], motion.velocity)[0]
+        twist = twists(numbers, numbers.headings(motion.position), motion.velocity)[0]
         pose = np.zeros((len(twist), 3))
         if found and found[-1].recording == motion.recording:
             pose[0] = found[-1].pose[-1] + 0.5 * (last_rate + twist[0]) * (motion.time[0] - found[-1].time[-1])
@@ -104,7 +104,7 @@ def _integral(values: FloatArray, steps: FloatArray) -> FloatArray:
 
 def normal_along(motion: RobotMotion, numbers: ModelNumbers, height: FloatArray | None = None) -> FloatArray:
     """Normal forces (T, n) [N] along a motion, over ground of a height (T, n) [m]."""
-    angle = np.ascontiguousarray(motion.position[:, :, STEER])
+    angle = numbers.headings(motion.position)
     twist, _ = twists(numbers, angle, motion.velocity)
     normal = normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)), height)
     return np.ascontiguousarray(normal[:, : len(numbers.steer_axis)])
@@ -233,7 +233,7 @@ class ChannelModel:
                 i = self.robot.caster_index(name)
                 position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.quiet_torque))
                 if axis == STEER:  # of the heading, whatever is read of it
-                    position = position + self.numbers.steer_zero[i]
+                    position = self.numbers.headings(motion.position)[:, i]
                 torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
             return dataclasses.replace(around, torque=torque)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
@@ -265,7 +265,8 @@ class ChannelModel:
 
     def wheel_places(self, motion: RobotMotion, i: int) -> FloatArray:
         """Centre of wheel i in the world (T, 2) [m]."""
-        c, s = np.cos(motion.position[:, i, STEER]), np.sin(motion.position[:, i, STEER])
+        heading = self.numbers.headings(motion.position)[:, i]
+        c, s = np.cos(heading), np.sin(heading)
         (bx, by), (sx, sy) = self.numbers.caster_offset[i], self.numbers.steer_axis[i]
         x, y = sx + bx * c - by * s, sy + bx * s + by * c
         c, s = np.cos(motion.pose[:, 2]), np.sin(motion.pose[:, 2])
@@ -283,7 +284,7 @@ class ChannelModel:
 
     def _in_wheel_frame(self, motion: RobotMotion, i: int, vectors: FloatArray) -> FloatArray:
         """Vectors of the world (T, 2) in the frame of wheel i (T, 2)."""
-        heading = motion.pose[:, 2] + motion.position[:, i, STEER]
+        heading = motion.pose[:, 2] + self.numbers.headings(motion.position)[:, i]
         c, s = np.cos(heading), np.sin(heading)
         return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0]], axis=1)
 
@@ -358,7 +359,7 @@ class ChannelModel:
         at = np.zeros((len(motion.time), FORCE_INPUTS))
         at[:, FORCE_TIME] = motion.time
         at[:, POSE_X : POSE_YAW + 1] = motion.pose
-        at[:, TWIST_X : TWIST_YAW + 1] = twists(self.numbers, motion.position[:, :, STEER], motion.velocity)[0]
+        at[:, TWIST_X : TWIST_YAW + 1] = twists(self.numbers, self.numbers.headings(motion.position), motion.velocity)[0]
         at[:, [COM_X, COM_Y, COM_Z]] = self._mass_and_centre()[1]
         return at
 

@@ -234,6 +234,10 @@ class ModelNumbers:
         """Chassis and modules [kg]."""
         return float(self.chassis[0] + self.modules[:, 0].sum())
 
+    def headings(self, position: FloatArray) -> FloatArray:
+        """Headings of the wheels (T, n) where joints stand at measured positions (T, n, 2) [rad]."""
+        return np.ascontiguousarray(position[:, :, STEER]) + self.steer_zero
+
     @property
     def height_of_mass(self) -> float:
         """Height of the common centre of mass [m], the modules' at their axles."""
@@ -613,7 +617,7 @@ def rolling_state(
     motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
 ) -> RollingState:
     """Return how the wheels roll along a motion, and the forces under them."""
-    steer_angle = np.ascontiguousarray(motion.position[:, :, STEER]) + numbers.steer_zero
+    steer_angle = numbers.headings(motion.position)
     if numbers.heading_lead:
         steer_angle += numbers.heading_lead * motion.velocity[:, :, STEER]
     velocity, radius = motion.velocity, np.broadcast_to(numbers.radius, steer_angle.shape)
