@@ -1,5 +1,6 @@
 """The channels of a robot: a healthy one is silent, a changed number and an effect show up where and as large as they are."""
 
+import copy
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -46,6 +47,26 @@ def column_fit(builder: RobotProblemBuilder, column: np.ndarray) -> tuple[float,
     coefficient = float(np.sum(target * explaining) / np.sum(explaining**2))
     left = target - coefficient * explaining
     return coefficient, float(1.0 - np.sum(left**2) / np.sum(target**2))
+
+
+def test_zeros_as_numbers_and_as_effects_are_one_thing_also_where_nothing_tracks_the_robot(tmp_path: Path) -> None:
+    """On a slope forces depend on the yaw that the wheels tell, and that on the zeros of their headings."""
+    slope = read_physics([{"name": "ground_slope", "angle": 0.03, "direction": 0.4}], THESIS.caster_names)
+    offset = 0.02
+    zeros = read_physics([{"name": "steer_zero_offset", "target": "front_left", "offset": offset}], THESIS.caster_names)
+    nominal = dataclasses.replace(THESIS, physics=slope)
+    described = dataclasses.replace(THESIS, physics=(*slope, *zeros))
+    recording = copy.copy(record(tmp_path, described, 1))
+    recording.ground_truth = None
+    problem, other = (RobotProblemBuilder(robot, [recording]).build(with_terms=False) for robot in (nominal, described))
+    change = {"steer_zero/front_left": -offset}
+    exact = problem.exact_at(change, ())
+    [column] = [n.column for n in problem.nuisances if n.name in change]
+    left = exact.residual + column * offset
+    valid = problem.valid[:, 0] & other.valid[:, 0]
+    sizes = [float(np.sqrt(np.mean(values[valid, :2] ** 2))) for values in (problem.residual, left, left - other.residual)]
+    print(f"rms forces: undescribed {sizes[0]:.3g}, tuned {sizes[1]:.3g}, difference from described {sizes[2]:.3g} N")
+    assert sizes[2] < 0.02 * sizes[1]
 
 
 @pytest.mark.parametrize("plant", ["reduced", "pybullet"])
