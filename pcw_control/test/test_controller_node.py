@@ -184,7 +184,9 @@ def test_a_command_from_before_the_first_measurement_is_outdated(ros):
 
 
 def test_goes_to_a_goal(ros):
-    ros.start(CONTROLLER, "-p", "goal_speed:=1.0", "-p", "goal_acceleration:=2.0")
+    # A machine busy with other tests may pause for longer than a robot: that would take the goal away.
+    unhurried = ("-p", "joint_states_timeout:=1.0")
+    ros.start(CONTROLLER, "-p", "goal_speed:=1.0", "-p", "goal_acceleration:=2.0", *unhurried)
     robot = Robot(ros)
     robot.run(lambda: robot.commands, cmd_vel=False)
     goals = ros.peer.create_publisher(PoseStamped, "goal_pose", 1)
