@@ -137,7 +137,7 @@ def test_it_is_said_so_with_the_leading_variable_and_no_name(law, channel, leadi
     # No kernel of a joint sees another joint, or the time: the law is proved on the channels alone.
     assert unknown.effect is None and "kernel" in unknown.without_effect
     assert unknown.helps and findings.fit is not None and findings.fit.gap_closed > 0.8
-    assert any(note.startswith(f"The simulation is without the dependence of {channel}") for note in findings.notes)
+    assert any(note.startswith(f"The simulation is without unknown/{channel}") for note in findings.notes)
 
 
 def loaded(effect: GeneratedEffect, folder: Path) -> Effect:

@@ -158,21 +158,17 @@ def analyse(
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),
     )
-    return Analysis(findings, patched, _with_laws(subject, instances, _reported_numbers(explanation), unknown, proof.tuned))
+    return Analysis(findings, patched, _with_laws(subject, instances, numbers, unknown))
 
 
 def _with_laws(
-    subject: Subject,
-    instances: Sequence[EffectInstance],
-    numbers: Mapping[str, float],
-    unknown: Sequence[UnknownFinding],
-    tuned: bool,
+    subject: Subject, instances: Sequence[EffectInstance], numbers: Mapping[str, float], unknown: Sequence[UnknownFinding]
 ) -> Mapping[str, Any] | None:
     """The patched description with the laws that are effects; see `Analysis`."""
     made = [left.effect for left in unknown if left.helps and left.effect is not None]
     laws = [EffectInstance(effect.name, effect.target, effect.parameters, None) for effect in made]
-    with also_known(effect.effect() for effect in made):
-        return subject.patched([*instances, *laws], numbers if tuned else {}).mapping() if laws else None
+    with also_known(effect.loaded for effect in made):
+        return subject.patched([*instances, *laws], numbers).mapping() if laws else None
 
 
 def _instance(named: NamedTerm) -> EffectInstance:

@@ -16,7 +16,7 @@ ABOVE_BURSTS = 3.0
 # By so much more must effects stand out whose columns hold noise that the residual holds; and by so much more again where they
 # are on all casters alike: what gears that wind up do to all wheels at once, a chassis that pitches on its springs does, too.
 NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
-# Part of what remains that such an effect must do that is on some casters; else all of it. Noise is not at one of them alone.
+# Such an effect must do this part of what remains in some channel, and all of it where it is on all casters, as noise is.
 NOISY_PART = 0.75
 # An effect that by itself is so many deviations of the model's scale is no wrong scale, though others undo most of it.
 BEYOND_SCALE = 20.0

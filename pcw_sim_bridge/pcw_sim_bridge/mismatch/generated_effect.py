@@ -8,6 +8,7 @@ or time, pose and twist of the chassis. A law that depends on anything else cann
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -56,8 +57,9 @@ class GeneratedEffect:
     parameters: Mapping[str, float]
     source: str
 
-    def effect(self) -> Effect:
-        """Return what a reader of the file gets, without a file."""
+    @functools.cached_property
+    def loaded(self) -> Effect:
+        """What a reader of the file gets, without a file."""
         module: dict[str, Any] = {"__name__": self.name}
         exec(compile(self.source, f"<{self.name}>", "exec"), module)
         effect = module["EFFECT"]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Container, Mapping
+from collections.abc import Container
 
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.effect import Effect
@@ -14,14 +13,6 @@ from .generated_effect import GeneratedEffect, NoSuchKernelError, generate, para
 from .regression_problem import UNKNOWN, FloatArray, RegressionProblem
 from .unknown_law import Law
 from .whitened_regression import Instance
-
-
-@dataclasses.dataclass(frozen=True)
-class _Simulated:
-    """A law as an effect that simulators know for a while."""
-
-    made: GeneratedEffect
-    effect: Effect
 
 
 class LawModels:
@@ -36,7 +27,7 @@ class LawModels:
         """Find the laws but for those refused, and make each an effect if the kernel of one can hold it."""
         self.laws: dict[Instance, Law] = {}
         self.without_kernel: dict[Instance, str] = {}
-        self._simulated: dict[Instance, _Simulated] = {}
+        self._made: dict[Instance, GeneratedEffect] = {}
         terms = explanation.search.problem.terms
         for instance in explanation.selection.fit.instances:
             term = terms[instance.term]
@@ -45,22 +36,16 @@ class LawModels:
                 if left.law is None or (left.law.sites, left.law.depends_on) != (term.target, term.arguments):
                     continue
                 self.laws[instance] = left.law
-                taken = [*all_effects(), *(known.made.name for known in self._simulated.values())]
+                taken = [*all_effects(), *(made.name for made in self._made.values())]
                 try:
-                    made = generate(left.law, left.weights, (), taken)
-                    self._simulated[instance] = _Simulated(made, made.effect())
+                    self._made[instance] = generate(left.law, left.weights, (), taken)
                 except NoSuchKernelError as error:
                     self.without_kernel[instance] = str(error)
 
     @property
     def effects(self) -> list[Effect]:
         """The laws that simulators can have."""
-        return [known.effect for known in self._simulated.values()]
-
-    def name(self, instance: Instance) -> str:
-        """Say a law in a few words."""
-        law = self.laws[instance]
-        return f"the dependence of {' and '.join(law.sites)} on {', '.join(law.depends_on)}"
+        return [made.loaded for made in self._made.values()]
 
     def in_problem(self, other: RegressionProblem) -> RegressionProblem:
         """The problem of other recordings with the laws as further terms; as it is where it has no sites."""
@@ -71,8 +56,7 @@ class LawModels:
 
     def simulated(self, instance: Instance, weights: FloatArray) -> EffectInstance | None:
         """A law with weights (K,) as it stands under `physics:`; None where simulators cannot have it."""
-        if instance not in self._simulated:
+        if instance not in self._made:
             return None
-        made = self._simulated[instance].made
-        numbers: Mapping[str, float] = parameters_of(self.laws[instance].basis, weights)
-        return EffectInstance(made.name, made.target, dict(numbers), None)
+        made = self._made[instance]
+        return EffectInstance(made.name, made.target, parameters_of(self.laws[instance].basis, weights), None)

@@ -141,7 +141,7 @@ class Prover:
             if useless is None:
                 break
             index, reason = useless
-            label, nats = self._label(explanation, held_out.instances[index]), held_out.help_of(index)[0]
+            label, nats = explanation.search.label(held_out.instances[index]), held_out.help_of(index)[0]
             dropped.append(LadderFinding(f"drop {label}", nats, nats, f"fitted but did not help held out: {reason}"))
             notes.append(f"{label} was fitted but did not help held out: {reason}. It is not proposed.")
             kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
@@ -179,9 +179,6 @@ class Prover:
     def _is_patched(self, explanation: Explanation) -> bool:
         """Whether there is anything beside which numbers of the description are re-tuned."""
         return bool(explanation.named or self.laws.laws) or self.besides
-
-    def _label(self, explanation: Explanation, instance: Instance) -> str:
-        return self.laws.name(instance) if instance in self.laws.laws else explanation.search.label(instance)
 
     def _numbers(self, explanation: Explanation) -> Mapping[str, float]:
         """Numbers of the description that go into the patch."""
@@ -339,12 +336,12 @@ class Prover:
             )
         for index in held_out.proposed:
             if held_out.help_of(index)[1] <= AT_WORK:
-                label = self._label(explanation, held_out.instances[index])
+                label = explanation.search.label(held_out.instances[index])
                 remarks.append(f"{label} was not at work in what was held out: nothing there speaks for it or against it.")
         for name in dict.fromkeys(n.term.effect for n in explanation.named if is_event(n.term.effect)):
             remarks.append(f"{name} comes once, from outside: the time in which it acts is left out of the proof.")
         for instance, reason in self.laws.without_kernel.items():
-            remarks.append(f"The simulation is without {self.laws.name(instance)}: {reason}.")
+            remarks.append(f"The simulation is without {explanation.search.label(instance)}: {reason}.")
         if self.windows is not None and after is not None:
             away = _ran_away(self.windows, after)
             if away.any():

@@ -10,8 +10,8 @@ without it, and than the same run against a description that holds the effect [n
 
 exact where the re-tuning comes out. W whitens the noise of the healthy run: channels share the noise of torques and angles,
 and what looks like it is no evidence. rho is Huber's loss: where wheels slip hard a little other motion leaves much else.
-Each run has its own columns: what two runs differ by is no change of one motion, as soon as the effect moves the robot. What
-the model misjudges on its other way is no evidence, and that the description with the effect does not explain either.
+Each run has its own columns: what two runs differ by is no change of one motion, as soon as the effect moves the robot. On its
+other way the model misjudges other things, also with the effect in the description: they are no evidence of it.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class HealthyChannels:
     def evidence(
         self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance] = ()
     ) -> float:
-        """What these runs cost against another description more than the healthy ones against their own [nats]."""
+        """The evidence of effects in these runs against another description [nats], see above."""
         cost, _ = self._cost(_build(nominal, recordings, self._cutoff))
         return max(cost - self._explained(nominal, recordings, effects), 0.0)
 
