@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -21,6 +20,7 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import effects_text, read_physics
 from pcw_description.errors import DescriptionError, PcwError, nearest_name
 from pcw_description.robot_file import load_robot
+from pcw_description.stop_requests import stop_requests
 
 from .plants.plant import PLANT_NAMES
 from .run_controllers import CONTROLLER_NAMES
@@ -87,11 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n\n".join([effects_text()] * options.list_effects + [excitations_text()] * options.list_excitations))
         return 0
     _check(command_line, options)
-    # A terminated run removes its folder as an interrupted one does, also where a shell started it with SIGINT ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
-        run(options)
+        with stop_requests() as stops:
+            run(options, stops)
     except PcwError as error:
         print(f"simulate: {error}", file=sys.stderr)
         return 2
@@ -119,11 +117,16 @@ def _check(command_line: argparse.ArgumentParser, options: argparse.Namespace) -
         command_line.error("--ideal with --stamp-jitter or --loss is not allowed; allowed: one or the other")
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, stops: Sequence[float]) -> None:
     """Simulate, and print a line on what was written.
+
+    Args:
+        options: of the command line.
+        stops: the run ends when this is no longer empty.
 
     Raises:
         PcwError: an option that is not allowed, or a run that cannot be done; names the field, its value and what is.
+        KeyboardInterrupt: it was stopped; nothing is left of the recording.
     """
     nominal = load_robot(options.robot)
     added = [effect for given in options.physics for effect in added_physics(given, nominal.caster_names)]
@@ -141,7 +144,7 @@ def run(options: argparse.Namespace) -> None:
             LOSS if options.loss is None else options.loss,
         )
     begun = time.monotonic()
-    progress = _Progress(excitation.duration) if sys.stderr.isatty() else None
+    progress = _Progress(excitation.duration, stops)
     try:
         counts = record_run(
             robot, excitation.twist, excitation.duration, options.seed, options.out, options.plant,
@@ -149,8 +152,7 @@ def run(options: argparse.Namespace) -> None:
             progress=progress,
         )
     finally:
-        if progress is not None:
-            progress.wipe()
+        progress.wipe()
     print(_said(options.out, excitation.duration, counts, time.monotonic() - begun))
 
 
@@ -182,14 +184,17 @@ def excitations_text() -> str:
 
 
 class _Progress:
-    """Rewrites one line on standard error, in real time."""
+    """Ends a run that is to stop, and on a terminal rewrites one line on standard error, in real time."""
 
-    def __init__(self, duration: float) -> None:
-        self._duration, self._told, self._width = duration, time.monotonic(), 0
+    def __init__(self, duration: float, stops: Sequence[float]) -> None:
+        self._duration, self._stops = duration, stops
+        self._tells, self._told, self._width = sys.stderr.isatty(), time.monotonic(), 0
 
     def __call__(self, simulated: float) -> None:
+        if self._stops:
+            raise KeyboardInterrupt
         now = time.monotonic()
-        if now - self._told < PROGRESS_PERIOD:
+        if not self._tells or now - self._told < PROGRESS_PERIOD:
             return
         self._told = now
         line = f"simulate: {simulated:.1f} of {self._duration:g} s"

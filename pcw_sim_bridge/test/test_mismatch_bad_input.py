@@ -275,8 +275,9 @@ def test_a_recording_that_was_cut_off_is_used_as_far_as_it_goes(
     assert report["inputs"][0]["warnings"]
 
 
-def test_interrupting_leaves_the_earlier_report_and_nothing_else(recorded: Path, tmp_path: Path) -> None:
-    """Ctrl-C in the middle of a run that would have replaced a report."""
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_interrupting_leaves_the_earlier_report_and_nothing_else(recorded: Path, tmp_path: Path, signum: int) -> None:
+    """In the middle of a run that would have replaced a report, also from a shell that has its jobs ignore Ctrl-C."""
     out = tmp_path / "report"
     assert main(["analyze", str(recorded), "--robot", "thesis", "--out", str(out), "--quiet"]) == 0
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
@@ -284,12 +285,12 @@ def test_interrupting_leaves_the_earlier_report_and_nothing_else(recorded: Path,
         [sys.executable, "-m", "pcw_sim_bridge.mismatch", "analyze", str(recorded), "--robot", "thesis", "--out", str(out),
          "--force"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )  # fmt: skip
     assert run.stderr is not None
     assert "reading" in run.stderr.readline()
     time.sleep(0.5)
-    run.send_signal(signal.SIGINT)
+    run.send_signal(signum)
     _, errors = run.communicate(timeout=120)
     # Ctrl-C in an import from compiled code ends Python by the signal, whatever its exit code: a shell sees 130 either way.
     assert run.returncode in (130, -signal.SIGINT), errors

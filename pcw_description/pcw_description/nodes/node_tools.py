@@ -20,13 +20,9 @@ from __future__ import annotations
 import array
 import inspect
 import math
-import signal
 import sys
-import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,6 +43,7 @@ from sensor_msgs.msg import JointState
 from pcw_description.errors import PcwError, nearest_name
 from pcw_description.one_thread import one_thread
 from pcw_description.short_collections import short_collections
+from pcw_description.stop_requests import stop_requests
 
 try:
     from rclpy.experimental.events_executor import EventsExecutor
@@ -80,12 +77,12 @@ def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | Non
     rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Node] = []
     exit_code = 0
-    with _stop_requests() as stop_requests:
+    with stop_requests() as stops:
         try:
             for factory in factories:
                 nodes.append(factory())
                 _warn_of_unknown_overrides(nodes[-1])
-            _spin(nodes, stop_requests)
+            _spin(nodes, stops)
         except (KeyboardInterrupt, ExternalShutdownException):
             pass
         except (PcwError, ParameterException) as error:
@@ -102,7 +99,7 @@ def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | Non
     return exit_code
 
 
-def _spin(nodes: Sequence[Node], stop_requests: list[float]) -> None:
+def _spin(nodes: Sequence[Node], stops: Sequence[float]) -> None:
     executor = make_executor()
     try:
         for node in nodes:
@@ -110,7 +107,7 @@ def _spin(nodes: Sequence[Node], stop_requests: list[float]) -> None:
         _find_modules()
         short_collections()
         # EventsExecutor.spin() of Jazzy may spin without calling anything; spin_once() is sound.
-        while rclpy.ok() and not stop_requests and not _all_finished(nodes):
+        while rclpy.ok() and not stops and not _all_finished(nodes):
             executor.spin_once(timeout_sec=SPIN_TIMEOUT)
     finally:
         executor.shutdown()
@@ -132,28 +129,6 @@ def _all_finished(nodes: Sequence[Node]) -> bool:
 def make_executor() -> Executor:
     """An EventsExecutor (at most half the cost) where this Jazzy has it, else a SingleThreadedExecutor."""
     return EventsExecutor()
-
-
-@contextmanager
-def _stop_requests() -> Iterator[list[float]]:
-    """Collect the times of SIGINT and SIGTERM in a list instead of letting them end the process."""
-    received: list[float] = []
-
-    def request_stop(number: int, frame: FrameType | None) -> None:
-        received.append(time.monotonic())
-        # a terminal and a parent may both deliver the same Ctrl-C, so only a later one is an insistent one
-        if received[-1] - received[0] > 1.0:
-            raise KeyboardInterrupt
-
-    try:
-        previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not in the main thread (a test that spins a node): whoever started it stops it
-        previous = {}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _close(node: Node) -> int:

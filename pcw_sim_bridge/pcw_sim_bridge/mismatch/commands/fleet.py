@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
 import time
 from pathlib import Path
@@ -50,9 +49,6 @@ def run(options: argparse.Namespace) -> int:
         raise MismatchError(f"--workers {options.workers} is not allowed; allowed: 1 and above")
     if options.scheduler is not None and options.workers is not None:
         raise MismatchError("--workers with --scheduler is not allowed; a cluster has its own workers")
-    # A terminated run ends its workers as an interrupted one does, also where a shell started it with SIGINT ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     tasks = find_tasks(options.bags, FleetRobots.read(options.robot), remapped_topics(options.topic), options.seed)
     progress = FleetProgress(len(tasks), options.quiet)
     results = FleetResults(options.out)
