@@ -114,6 +114,28 @@ def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object
         assert values["factor"] == pytest.approx(0.3, rel=0.2)
 
 
+@pytest.mark.parametrize("again", [True, False])
+def test_a_push_is_proved_on_held_out_data_only_if_it_comes_there_too(again: bool, tmp_path: Path) -> None:
+    """At the same time, as where somebody staged it; a recording without a push proves nothing, and is not made worse."""
+    push = {"name": "external_push", "target": ["chassis"], "force_x": 20.0, "force_y": -8.0, "start": 6.3, "duration": 1.5}
+    pushed = dataclasses.replace(THESIS, physics=read_physics([push], THESIS.caster_names))
+    for seed, robot in ((1, pushed), (2, pushed if again else THESIS)):
+        excitation = make_excitation("identification", THESIS, 16.0, seed)
+        record_run(robot, excitation.twist, 16.0, seed, tmp_path / f"run_{seed}", "reduced", controlled_as=THESIS)
+    findings = analyse(
+        RobotSubject(THESIS), [tmp_path / "run_1"], [tmp_path / "run_2"], {}, 0, lambda message: None
+    ).findings
+    assert [effect.name for effect in findings.effects] == ["external_push"]
+    assert findings.fit is not None
+    closed = (findings.fit.gap_closed, findings.fit.rollout_gap_closed)
+    notes = " ".join(findings.notes)
+    if again:
+        assert min(closed) > 0.9 and "comes at the same time in what was held out" in notes
+    else:
+        before, after = findings.fit.inverse_nrmse
+        assert after < 1.01 * before and "is left out of the proof" in notes
+
+
 def test_a_push_that_ends_while_nothing_can_be_judged_may_end_at_any_time_of_that(tmp_path: Path) -> None:
     """The robot stands from 7 to 10 s, and the push ends at 9 s: the interval of its duration holds all that time."""
 

@@ -394,7 +394,7 @@ def test_what_the_model_does_wrong_in_a_wilder_motion_speaks_against_no_effect()
     wilder = linear_problem(0.008 * works + noise[1] - 0.4 * wild, {"same": (works, 100.0)})
     search = EffectSearch(fitted, np.random.default_rng(0))
     same = (Instance(0, (), (0,)),)
-    held_out = HeldOut.recordings(fitted, same, (0,), search.conclude(same, 9.0), wilder)
+    held_out = HeldOut.recordings(fitted, same, same[:1], search.conclude(same, 9.0), wilder)
     nats, work = held_out.help_of(0)
     assert work > 0.0 and nats > 9.0  # which its tolerance says
 

@@ -7,7 +7,7 @@ more than a small system of equations.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -52,14 +52,15 @@ class HeldOut:
         cls,
         problem: RegressionProblem,
         instances: Sequence[Instance],
-        proposed: Sequence[int],
+        proposed: Collection[Instance],
         selection: Selection,
         other: RegressionProblem,
+        gone: Collection[Instance] = (),
     ) -> HeldOut:
-        """Hold out other recordings: fitted on all of `problem`, judged on `other`."""
+        """Hold out other recordings: fitted on all of `problem`, judged on `other`, where what is `gone` is not at work."""
         regression = selection.regression
         other = _exact_elsewhere(problem, other)
-        columns = _columns_elsewhere(problem, instances, other)
+        columns = _columns_elsewhere(problem, instances, other, gone)
         flat = np.concatenate([columns, other.residual[:, :, None]], axis=2)
         everything = np.zeros(len(other.time), dtype=np.int64)
         train = regression.grams(instances).sum(axis=0)
@@ -73,7 +74,7 @@ class HeldOut:
         return cls(
             other,
             tuple(instances),
-            tuple(proposed),
+            _positions(instances, proposed),
             columns,
             everything,
             train[None],
@@ -85,7 +86,7 @@ class HeldOut:
 
     @classmethod
     def manoeuvres(
-        cls, problem: RegressionProblem, instances: Sequence[Instance], proposed: Sequence[int], selection: Selection
+        cls, problem: RegressionProblem, instances: Sequence[Instance], proposed: Collection[Instance], selection: Selection
     ) -> HeldOut:
         """Hold out manoeuvres of the fitted recordings in turn, each judged by a fit to the others."""
         number = manoeuvres(problem)
@@ -97,7 +98,7 @@ class HeldOut:
         return cls(
             problem,
             tuple(instances),
-            tuple(proposed),
+            _positions(instances, proposed),
             _columns_elsewhere(problem, instances, problem),
             number % FOLDS,
             test.sum(axis=0) - test,
@@ -210,8 +211,14 @@ def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> Re
     return exact.derived() if problem.point.derived else exact
 
 
-def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance], other: RegressionProblem) -> FloatArray:
-    """Columns (T, C, k) in another problem of the nuisances and effects of a problem, matched by name."""
+def _positions(instances: Sequence[Instance], wanted: Collection[Instance]) -> tuple[int, ...]:
+    return tuple(index for index, instance in enumerate(instances) if instance in wanted)
+
+
+def _columns_elsewhere(
+    problem: RegressionProblem, instances: Sequence[Instance], other: RegressionProblem, gone: Collection[Instance] = ()
+) -> FloatArray:
+    """Columns (T, C, k) in another problem of the nuisances and effects of a problem, matched by name; zeros for `gone`."""
     nuisances = {nuisance.name: nuisance.column for nuisance in other.nuisances}
     places = {term.key: index for index, term in enumerate(other.terms)}
     nothing = np.zeros(other.residual.shape)
@@ -219,7 +226,7 @@ def _columns_elsewhere(problem: RegressionProblem, instances: Sequence[Instance]
     for instance in instances:
         term = problem.terms[instance.term]
         names = [term.parameters[k].name for k in instance.active]
-        if term.key not in places:
+        if term.key not in places or instance in gone:
             parts.append(np.zeros((*nothing.shape, len(names))))
             continue
         place = places[term.key]

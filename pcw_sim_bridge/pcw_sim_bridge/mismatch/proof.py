@@ -199,9 +199,8 @@ class Prover:
         """The folds for the effects of an explanation that last; the time of the others is taken out of the data."""
         problem, selection = explanation.search.problem, explanation.selection
         events = {named.instance for named in explanation.named if is_event(named.term.effect)}
-        lasting = [instance for instance in selection.fit.instances if instance not in events]
         modelled = {*(entry.instance for entry in explanation.named), *self.laws.laws}
-        proposed = [index for index, instance in enumerate(lasting) if instance in modelled]
+        instances = selection.fit.instances
         if self.other is not None:
             other = self.laws.in_problem(self.other)
             names = [[c.name for c in p.channels] for p in (problem, other)]
@@ -211,10 +210,14 @@ class Prover:
                     f"channels {differ} are only in the fitted or only in the held-out recordings; allowed: recordings with "
                     "the same sensors in one analysis"
                 )
-            return HeldOut.recordings(problem, lasting, proposed, selection, other)
+            judged = HeldOut.recordings(problem, instances, modelled, selection, other)
+            # What was staged comes at the same time of every recording.
+            gone = {instance for index, instance in enumerate(instances) if instance in events and not _tells(judged, index)}
+            return HeldOut.recordings(problem, instances, modelled - gone, selection, other, gone) if gone else judged
         busy = _busy(explanation)
         quiet = dataclasses.replace(problem, valid=problem.valid & ~busy[:, None]) if busy.any() else problem
-        return HeldOut.manoeuvres(quiet, lasting, proposed, selection)
+        lasting = [instance for instance in instances if instance not in events]
+        return HeldOut.manoeuvres(quiet, lasting, modelled, selection)
 
     def _quiet_windows(self, explanation: Explanation) -> Windows | None:
         """The windows, with nothing to judge in them while an event was at work."""
@@ -338,8 +341,13 @@ class Prover:
             if held_out.help_of(index)[1] <= AT_WORK:
                 label = explanation.search.label(held_out.instances[index])
                 remarks.append(f"{label} was not at work in what was held out: nothing there speaks for it or against it.")
-        for name in dict.fromkeys(n.term.effect for n in explanation.named if is_event(n.term.effect)):
-            remarks.append(f"{name} comes once, from outside: the time in which it acts is left out of the proof.")
+        at_work = {held_out.instances[index] for index in held_out.proposed}
+        for named in explanation.named:
+            if is_event(named.term.effect):
+                label = explanation.search.label(named.instance)
+                once = "comes once, from outside: the time in which it acts is left out of the proof"
+                again = "comes at the same time in what was held out"
+                remarks.append(f"{label} {again if named.instance in at_work else once}.")
         for instance, reason in self.laws.without_kernel.items():
             remarks.append(f"The simulation is without {explanation.search.label(instance)}: {reason}.")
         if self.windows is not None and after is not None:
@@ -472,6 +480,12 @@ def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFindi
         harm=max(finding.harm, grown),
         harm_at=worst.name if grown > finding.harm else finding.harm_at,
     )
+
+
+def _tells(held_out: HeldOut, index: int) -> bool:
+    """Whether an effect is at work in what was held out, and helps there."""
+    nats, work = held_out.help_of(index)
+    return work > AT_WORK and nats > 0.0
 
 
 def _busy(explanation: Explanation) -> np.ndarray:
