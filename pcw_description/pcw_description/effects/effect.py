@@ -8,6 +8,7 @@ An effect is written once. A simulator calls its contribution, the analyser its 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -51,6 +52,11 @@ class EffectParameter:
     pole: float = 0.0
     neutral: str | float = ""
     clause: str = ""
+
+    @property
+    def is_direction(self) -> bool:
+        """Whether it is an angle of which all of a turn may be, so that a turn more is the same."""
+        return self.unit == "rad" and self.upper - self.lower > math.tau
 
 
 @dataclasses.dataclass(frozen=True)

@@ -398,7 +398,8 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
         near = regression if around is problem else regression.moved(around)
         for name, value in instance.shape:
             low, high = shape_interval(near, others, instance, name, float(widening[position : position + active].max()))
-            estimates[name] = Estimate(value, "", low, high)
+            turns = math.tau * round(value / math.tau) if get(term.effect).parameter(name).is_direction else 0.0
+            estimates[name] = Estimate(value - turns, "", low - turns, high - turns)
         columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         contribution = columns @ fit.mean[position : position + active]
         position += active

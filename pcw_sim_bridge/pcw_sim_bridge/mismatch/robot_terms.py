@@ -179,7 +179,7 @@ class _TermMaker:
             return None
         if not (self.layout.balanced or self.layout.imu) and target == ("chassis",):
             return None  # loads and slopes would show as what tyres slip under forces that nobody measured
-        swings = isinstance(effect, EncoderEffect) and any(_is_direction(p) for p in effect.parameters if p not in searched)
+        swings = isinstance(effect, EncoderEffect) and any(p.is_direction for p in effect.parameters if p not in searched)
         if swings and not self._turns(target, axis or effect.axis):
             return None
         if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):
@@ -205,7 +205,7 @@ class _TermMaker:
         shown = [p for p, visible in zip(searched, seen, strict=True) if visible]
         names = [p.name for p in shown]
         remembered = _once_more(shapes[0], everything[:, :, seen], lambda shape: columns(shape, names))
-        turning = next((p.name for p in effect.parameters if p.name in chosen.resolution and _is_direction(p)), None)
+        turning = next((p.name for p in effect.parameters if p.name in chosen.resolution and p.is_direction), None)
 
         return Term(
             effect=effect.name,
@@ -290,7 +290,7 @@ class _TermMaker:
     def _rolls_unevenly(self, effect: ContactEffect) -> bool:
         """Whether an effect on contacts shows in how wheels roll, whatever the forces: by where they are in their turn."""
         searched = effect.searched_parameters
-        return any(_is_direction(p) for p in effect.parameters if p not in searched) and not _look_of(effect)
+        return any(p.is_direction for p in effect.parameters if p not in searched) and not _look_of(effect)
 
     def _turns(self, target: Sequence[str], axis: str) -> bool:
         """Whether joints turn far enough to tell what swings once per turn from a zero and a scale."""
@@ -324,7 +324,7 @@ class _TermMaker:
                 span = float(reach["xy".index(parameter.name)])
                 values = [-0.7 * span, 0.0, 0.7 * span]
                 resolution[parameter.name] = ("linear", 0.35 * span)
-            elif _is_direction(parameter):
+            elif parameter.is_direction:
                 values = [k * math.tau / DIRECTIONS for k in range(DIRECTIONS)]
                 resolution[parameter.name] = ("linear", 0.5 * math.tau / DIRECTIONS)
             elif parameter.default is not None:
@@ -345,11 +345,6 @@ def _once_more(
         return known.pop(frozen(shape)) if frozen(shape) in known else columns(shape)
 
     return kept
-
-
-def _is_direction(parameter: EffectParameter) -> bool:
-    """Whether a parameter is an angle of which all of a turn may be."""
-    return parameter.unit == "rad" and parameter.upper - parameter.lower > math.tau
 
 
 def _look_of(effect: Effect) -> str:

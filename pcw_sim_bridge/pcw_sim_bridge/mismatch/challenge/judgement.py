@@ -252,7 +252,7 @@ def _error(effect: Mapping[str, Any], name: str, said: Mapping[str, Any], tuned_
     """Compare a number with the true one, of which the description may hold a part."""
     true, value, (low, high) = effect["parameters"][name] - tuned_in, said["value"], said["ci95"]
     parameter = all_effects()[effect["name"]].parameter(name)
-    if parameter.unit == "rad" and parameter.upper - parameter.lower > 2.0 * math.pi:
+    if parameter.is_direction:
         turned = math.remainder(true - value, 2.0 * math.pi)
         return ParameterError(effect["name"], name, abs(turned) / math.pi, low <= value + turned <= high)
     vector = next((v for v in VECTORS if name in v and all(part in effect["parameters"] for part in v)), (name,))
