@@ -9,7 +9,7 @@ import pytest
 from scipy import signal
 
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, Selection
-from pcw_sim_bridge.mismatch.explanation import named_terms
+from pcw_sim_bridge.mismatch.explanation import named_terms, search_effects
 from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.regression_problem import (
@@ -397,6 +397,35 @@ def test_what_the_model_does_wrong_in_a_wilder_motion_speaks_against_no_effect()
     held_out = HeldOut.recordings(fitted, same, same[:1], search.conclude(same, 9.0), wilder)
     nats, work = held_out.help_of(0)
     assert work > 0.0 and nats > 9.0  # which its tolerance says
+
+
+@pytest.mark.parametrize(("off", "loose", "names"), [(3.0, False, []), (5.5, False, ["same"]), (5.5, True, [])])
+def test_an_effect_behind_a_number_that_no_healthy_system_has_is_found(off, loose, names):
+    """To be so far off costs the number less than an effect has to explain. Of tyres anything may be true."""
+    time = np.arange(3000) / RATE
+    works = np.cos(0.3 * time) + 0.02 * np.sin(1.7 * time)
+    left = 1e-3 * off * works + 0.01 * np.random.default_rng(7).standard_normal(len(time))
+    problem = linear_problem(left, {"same": (works, 100.0)})
+    problem = dataclasses.replace(problem, nuisances=(dataclasses.replace(problem.nuisances[0], loose=loose),))
+    settings, said = SelectionSettings(surrogates=20), []
+    search, selection = search_effects(problem, np.random.default_rng(0), settings, said.append)
+    assert [search.problem.terms[i.term].effect for i in selection.fit.instances] == names
+    assert any("narrower tolerances" in line for line in said) == bool(names)
+
+
+def test_a_number_that_no_healthy_system_has_is_no_rival_held_out():
+    """Twelve tolerances off it foretells other data better than an effect of which more is at work there."""
+    time = np.arange(3000) / RATE
+    works = np.cos(0.3 * time)
+    noise = 1e-3 * np.random.default_rng(7).standard_normal((2, len(time)))
+    fitted = linear_problem(0.012 * works + noise[0], {"same": (works, 100.0)})
+    other = linear_problem(0.012 * works + noise[1], {"same": (1.7 * works, 100.0)})
+    search = EffectSearch(fitted, np.random.default_rng(0))
+    same = (Instance(0, (), (0,)),)
+    held_out = HeldOut.recordings(fitted, same, same[:1], search.conclude(same, 9.0), other)
+    anything = dataclasses.replace(held_out, healthy=np.array([np.inf]))
+    assert held_out.help_of(0)[0] > 30.0
+    assert anything.help_of(0)[0] < 9.0
 
 
 def odds_of_second(residual: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, float]:

@@ -100,6 +100,14 @@ def cubic(state: PlantState, motor: np.ndarray) -> np.ndarray:
     return torque
 
 
+def hard_spot(state: PlantState, motor: np.ndarray) -> np.ndarray:
+    """Friction at one place of the turn of one wheel; named a row of coggings by who does not look."""
+    torque = np.zeros((4, 2))
+    from_spot = np.angle(np.exp(1j * (state.joint_position[2, 0] - 1.0)))
+    torque[2, 0] = -0.5 * np.exp(-0.5 * (from_spot / 0.3) ** 2) * np.tanh(state.joint_velocity[2, 0] / 0.05)
+    return torque
+
+
 def record(path: Path, law: ExtraTorque | None, seed: int, monkeypatch: pytest.MonkeyPatch, excitation: str = "identification",
            duration: float = 25.0) -> Path:  # fmt: skip
     """A run of the thesis robot with a mass that is off within tolerance."""
@@ -138,6 +146,14 @@ def test_it_is_said_so_with_the_leading_variable_and_no_name(law, channel, leadi
     assert unknown.effect is None and "kernel" in unknown.without_effect
     assert unknown.helps and findings.fit is not None and findings.fit.gap_closed > 0.8
     assert any(note.startswith(f"The simulation is without unknown/{channel}") for note in findings.notes)
+
+
+def test_one_place_of_a_turn_is_no_row_of_coggings(tmp_path, monkeypatch):
+    findings = analysed(record(tmp_path / "run", hard_spot, 3, monkeypatch)).findings
+    assert (findings.verdict, findings.effects) == ("unexplained", ())
+    [unknown] = findings.unknown
+    assert unknown.depends_on == ("drive_angle/rear_left", "drive_velocity/rear_left")
+    assert unknown.share_explained > 0.8
 
 
 def loaded(effect: GeneratedEffect, folder: Path) -> Effect:

@@ -210,7 +210,9 @@ def _effect_finding(subject: Subject, named: NamedTerm, instance: EffectInstance
         declared = effect.parameter(name)
         searched = {*(p.name for p in effect.searched_parameters), *(p.name for p in named.term.parameters)}
         if name in searched or declared.default is None or name in named.term.resolution:
-            parameters[name] = ParameterFinding(estimate.value, subject.unit(declared.unit), estimate.low, estimate.high)
+            turns = math.tau * round(estimate.value / math.tau) if declared.is_direction else 0.0
+            value, low, high = (number - turns for number in (estimate.value, estimate.low, estimate.high))
+            parameters[name] = ParameterFinding(value, subject.unit(declared.unit), low, high)
     return EffectFinding(
         name=named.term.effect,
         target=named.term.target,

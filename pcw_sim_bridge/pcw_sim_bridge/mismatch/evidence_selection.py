@@ -25,7 +25,7 @@ from .noise_model import (
     channel_deviations,
     fit_noise_model,
     huber_weights,
-    robust_deviation,
+    reliability,
     white_noise_model,
 )
 from .regression_problem import (
@@ -224,6 +224,12 @@ class EffectSearch:
                 break
         return found
 
+    def advantage(self, selection: Selection, instances: tuple[Instance, ...]) -> float:
+        """Nats of a selection over other effects, both where they are exact."""
+        sets = (selection.fit, selection.regression.fit(instances))
+        own, other = (self._exact_evidence(selection.regression, fit) for fit in sets)
+        return own - other
+
     def _exact_evidence(self, regression: WhitenedRegression, fit: Fit) -> float:
         """Log evidence of a set where it is exact, and its columns with it: what is reached there, not what is promised."""
         here, reached = (self.problem, self._point), -math.inf
@@ -342,15 +348,8 @@ class EffectSearch:
             noise = white_noise_model(residual, problem.valid)
         else:
             noise = fit_noise_model(residual, problem.valid, problem.segment)
-        weights = np.ones_like(residual)
-        for channel in range(residual.shape[1]):
-            values = residual[:, channel]
-            deviation = robust_deviation(values[problem.valid[:, channel]])
-            # What is large at the first look may be an event, which held down like an outlier would never be found.
-            robust = 1.0 if by_channel else huber_weights(values / deviation)
-            weights[:, channel] = problem.channels[channel].information * robust
-            if problem.misjudged is not None:
-                weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
+        # What is large at the first look may be an event, which held down like an outlier would never be found.
+        weights = reliability(problem, residual, robust=not by_channel)
         return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)
 
     def residual_of(self, instances: Sequence[Instance]) -> FloatArray:

@@ -10,10 +10,11 @@ import dataclasses
 from collections.abc import Collection, Sequence
 
 import numpy as np
+from scipy import optimize
 
 from .evidence_selection import Selection
 from .manoeuvres import manoeuvres
-from .noise_model import channel_deviations, huber_weights
+from .noise_model import channel_deviations, huber_weights, reliability
 from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProblem
 from .whitened_regression import Instance, WhitenedRegression
 
@@ -33,6 +34,7 @@ class HeldOut:
         fold: which fold judges each sample (T,).
         train, test: Gram matrices of [columns, residual], whitened, per fold (F, k + 1, k + 1).
         deviations: prior deviations (k,); nuisances: how many of the k are numbers of the description.
+        healthy: changes (nuisances,) up to which these are those of a healthy robot.
         source: what was held out, in words.
     """
 
@@ -45,6 +47,7 @@ class HeldOut:
     test: FloatArray
     deviations: FloatArray
     nuisances: int
+    healthy: FloatArray
     source: str
 
     @classmethod
@@ -66,7 +69,8 @@ class HeldOut:
         train = regression.grams(instances).sum(axis=0)
         deviations = regression.deviations(instances)
         mean = np.linalg.solve(train[:-1, :-1] + np.diag(1.0 / deviations**2), train[:-1, -1])
-        judged = WhitenedRegression(other, regression.noise, np.ones_like(other.residual), everything)
+        weights = reliability(other, other.residual - columns @ mean, robust=False)
+        judged = WhitenedRegression(other, regression.noise, weights, everything)
         white = judged.whiten_columns(flat)
         left = judged.spread(white[:, -1] - white[:, :-1] @ mean)
         white *= np.sqrt(judged.gather(_trust(left, other.valid)))[:, None]
@@ -81,6 +85,7 @@ class HeldOut:
             (white.T @ white)[None],
             deviations,
             len(problem.nuisances),
+            np.array([nuisance.healthy for nuisance in problem.nuisances]),
             f"{count} held-out recording{'s' if count > 1 else ''}",
         )
 
@@ -105,6 +110,7 @@ class HeldOut:
             test,
             regression.deviations(instances),
             len(problem.nuisances),
+            np.array([nuisance.healthy for nuisance in problem.nuisances]),
             f"{count} manoeuvres of the fitted recordings, each predicted from others",
         )
 
@@ -143,19 +149,38 @@ class HeldOut:
 
         The first is the logarithm of the ratio of their predictive densities, log p(held out | fitted): numbers of the
         description that the fitted data leave open are open for both. What the fitted data have moved them by foretells as
-        well as an effect does, however far that is; so what it costs is counted, too. But where what the effect does is not
-        in the held-out data, they speak against it however badly the fitted ones do without it: then the first is by how much
-        the error is smaller, and so negative, with what it does than with nothing in its place.
+        well as an effect does, however far that is; so what it costs is counted, too. And what no healthy robot's numbers do
+        is not re-tuning: where that is more, the first is by how much the error is smaller than with those. But where what the
+        effect does is not in the held-out data, they speak against it however badly the fitted ones do without it: then the
+        first is by how much the error is smaller, and so negative, with what it does than with nothing in its place.
         """
         both, alone = self.means(), self.means(index)
         better = self._foretold(self._kept(None)) - self._foretold(self._kept(index))
         better += self._retuning(alone) - self._retuning(both)
+        if np.any(np.abs(alone[:, : self.nuisances]) > self._limits(both)):
+            better = max(better, self._error(self._healthy_means(index, self._limits(both))) - self._error(both))
         rows = slice(*self.span(index))
         idle = both.copy()
         idle[:, rows] = 0.0
         work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
         smaller = self._error(idle) - self._error(both)
         return smaller if smaller < -CONTRADICTED else better, 0.5 * float(work)
+
+    def _limits(self, means: FloatArray) -> FloatArray:
+        """Changes (F, nuisances) up to which numbers of the description are those of a healthy robot, or as far as here."""
+        limits: FloatArray = np.maximum(self.healthy, np.abs(means[:, : self.nuisances]))
+        return limits
+
+    def _healthy_means(self, without: int, limits: FloatArray) -> FloatArray:
+        """Fitted numbers of every fold (F, k) without one effect, none of the description's beyond limits (F, nuisances)."""
+        kept = self._kept(without)
+        found = np.zeros((len(self.train), len(self.deviations)))
+        for mean, gram, limit in zip(found, self.train, limits, strict=True):
+            root = np.linalg.cholesky(gram[np.ix_(kept, kept)] + np.diag(1.0 / self.deviations[kept] ** 2))
+            bound = np.full(len(kept), np.inf)
+            bound[: self.nuisances] = limit
+            mean[kept] = optimize.lsq_linear(root.T, np.linalg.solve(root, gram[kept, -1]), (-bound, bound)).x
+        return found
 
     def _error(self, means: FloatArray) -> float:
         """Half the squared error of all folds with numbers (F, k), whitened."""

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import optimize
 
 from .regression_problem import FloatArray
-from .unknown_law import HARMONICS, Basis, Combination, Law
+from .unknown_law import Basis, Combination, Law
 
 LARGEST_GROUPS = 3
 # What a further number must improve the fit by, in units of the squared deviation: 10 nats, odds of a few thousand to one.
@@ -103,8 +103,8 @@ class ClosedForm(Basis):
 
 def fourier(basis: Basis) -> ClosedForm:
     """Return a periodic basis as a closed form with the same functions in the same order."""
-    atoms = [Atom(ONE), *(Atom(shape, (float(k),)) for shape in (COS, SIN) for k in range(1, HARMONICS + 1))]
-    return ClosedForm("closed", basis.knots, basis.width, tuple(atoms), clipped=False)
+    atoms = [Atom(ONE), *(Atom(shape, (float(k),)) for shape in (COS, SIN) for k in range(1, basis.harmonics + 1))]
+    return ClosedForm("closed", basis.knots, basis.width, atoms=tuple(atoms), clipped=False)
 
 
 def closed_form(basis: Basis, weights: FloatArray, covariance: FloatArray) -> ClosedForm | None:
@@ -154,13 +154,13 @@ def closed_form(basis: Basis, weights: FloatArray, covariance: FloatArray) -> Cl
         others = [other for other in chosen if other != atom]
         if others and misfit(others) < misfit(chosen) + PRICE:
             chosen = others
-    return ClosedForm("closed", basis.knots, basis.width, tuple(chosen), clipped=basis.kind != "periodic")
+    return ClosedForm("closed", basis.knots, basis.width, atoms=tuple(chosen), clipped=basis.kind != "periodic")
 
 
 def _groups(basis: Basis, low: float, high: float) -> list[tuple[Atom, ...]]:
     """Functions to try, one group at a time."""
     if basis.kind == "periodic":
-        return [(Atom(COS, (float(k),)), Atom(SIN, (float(k),))) for k in range(1, HARMONICS + 1)]
+        return [(Atom(COS, (float(k),)), Atom(SIN, (float(k),))) for k in range(1, basis.harmonics + 1)]
     groups: list[tuple[Atom, ...]] = [(Atom(LINEAR),), (Atom(SQUARE),), (Atom(CUBE),)]
     if basis.kind == "speed":
         return [*groups, (Atom(DRAG),), (Atom(SIGN, (basis.width,)),)]

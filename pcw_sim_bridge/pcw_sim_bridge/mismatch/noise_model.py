@@ -22,7 +22,7 @@ from scipy import linalg
 
 from pcw_description.compiled import compiled
 
-from .regression_problem import BoolArray, FloatArray, IntArray, segment_slices
+from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProblem, segment_slices
 
 HUBER = 4.0  # in robust standard deviations: spares a Gaussian and tames bursts
 AUTOREGRESSION_ORDER = 8
@@ -162,6 +162,18 @@ def huber_weights(standardised: FloatArray) -> FloatArray:
     """Weights min(1, HUBER / |x|) of standardised values."""
     size = np.abs(standardised)
     return np.where(size > HUBER, HUBER / np.maximum(size, 1e-300), 1.0)
+
+
+def reliability(problem: RegressionProblem, residual: FloatArray, robust: bool) -> FloatArray:
+    """Weights of samples (T, C) besides the noise: what channels tell, where the model guesses, and `robust`: outliers."""
+    weights = np.ones_like(residual)
+    for channel in range(residual.shape[1]):
+        values = residual[:, channel]
+        deviation = robust_deviation(values[problem.valid[:, channel]])
+        weights[:, channel] = problem.channels[channel].information * (huber_weights(values / deviation) if robust else 1.0)
+        if problem.misjudged is not None:
+            weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
+    return weights
 
 
 def robust_deviation(values: FloatArray) -> float:

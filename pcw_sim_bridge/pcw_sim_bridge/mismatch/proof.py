@@ -24,13 +24,12 @@ from .found_effect import effect_instance
 from .held_out import HeldOut
 from .law_models import LawModels
 from .paired_errors import PairedErrors, blocks_of, gap_closed, interval
-from .regression_problem import FloatArray, IntArray, RegressionProblem
+from .regression_problem import HEALTHY, FloatArray, IntArray, RegressionProblem
 from .rollout import HORIZONS, MAIN_HORIZON, RAN_AWAY, Windows
 from .subject import Opened, Subject
 from .unknown_law import Law
 from .whitened_regression import Instance
 
-HEALTHY = 3.0  # tolerances
 LEAST_PROBABILITY = 0.01  # of a name: below it stands for another one
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0

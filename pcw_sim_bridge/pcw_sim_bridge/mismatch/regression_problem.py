@@ -30,6 +30,8 @@ CURVED_FROM = 0.01
 WEAKER, POWERS = 0.8, (0.5, 3.0)
 PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
+HEALTHY = 3.0  # tolerances
+
 UNKNOWN = "unknown"  # reserved in the vocabulary for what no entry explains
 
 Shape = Mapping[str, float]  # values of the shaping parameters of one candidate
@@ -60,6 +62,8 @@ class Nuisance:
         deviation: standard deviation, same unit.
         column: d residual / d value, (T, C).
         changes: least and largest change that makes sense.
+        loose: a healthy one may be far beyond its tolerance, as of tyres: what the model misjudges of slips ends up there.
+        narrowed: part of the deviation that is allowed for, where an effect is looked for behind a number that strains it.
     """
 
     name: str
@@ -68,6 +72,13 @@ class Nuisance:
     deviation: float
     column: FloatArray
     changes: tuple[float, float] = (-math.inf, math.inf)
+    loose: bool = False
+    narrowed: float = 1.0
+
+    @property
+    def healthy(self) -> float:
+        """Change up to which it is that of a healthy system, same unit."""
+        return math.inf if self.loose else HEALTHY * self.deviation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -453,8 +464,14 @@ class RegressionProblem:
         return np.stack([nuisance.column for nuisance in self.nuisances], axis=2)
 
     def nuisance_deviations(self) -> FloatArray:
-        """Tolerances (K,)."""
-        return np.array([nuisance.deviation for nuisance in self.nuisances])
+        """Tolerances (K,) that are allowed for."""
+        return np.array([nuisance.deviation * nuisance.narrowed for nuisance in self.nuisances])
+
+    def narrowed(self, parts: Mapping[str, float]) -> RegressionProblem:
+        """Return the problem with parts of the tolerances of some numbers, by name."""
+        return dataclasses.replace(
+            self, nuisances=tuple(dataclasses.replace(n, narrowed=parts.get(n.name, n.narrowed)) for n in self.nuisances)
+        )
 
 
 def segment_slices(segment: IntArray) -> list[slice]:

@@ -54,7 +54,10 @@ def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) ->
     varied = varied_numbers(robot, differences)
     columns = on_all_cores(lambda n: differences.of_numbers(n.vary, 0.5 * n.deviation), varied)
     found = [
-        Nuisance(n.label, n.unit, n.nominal, math.hypot(n.deviation, _misjudged(n, column, differences)), column, n.changes)
+        Nuisance(
+            n.label, n.unit, n.nominal, math.hypot(n.deviation, _misjudged(n, column, differences)), column, n.changes,
+            loose=n.label.startswith("contact."),
+        )
         for n, column in zip(varied, columns, strict=True)
     ]
     return found + floor_nuisances(robot, differences)

@@ -23,6 +23,7 @@ from .regression_problem import UNKNOWN, FloatArray, LinearParameter, Regression
 KNOTS = 8
 FLOOR_KNOTS = 5  # along each side of a map
 HARMONICS = 3
+SPOT_HARMONICS = 8  # of what is at one place of a wheel's turn
 ALIKE = 0.3  # part of the range over which a curve is taken to change
 RARENESS = 4.0  # nats for every further variable, and for one of another joint
 RANGE_SAMPLES = 1000  # that the range of an argument is taken from
@@ -68,16 +69,18 @@ class Basis:
         kind: "map" (piecewise linear between knots), "periodic" (a Fourier series) or "speed" (a map and a sign).
         knots: of every argument.
         width: over which the sign of a "speed" reverses.
+        harmonics: of a "periodic".
     """
 
     kind: str
     knots: tuple[tuple[float, ...], ...]
     width: float = 0.0
+    harmonics: int = HARMONICS
 
     def functions(self, arguments: Sequence[FloatArray]) -> FloatArray:
         """Evaluate at values of the arguments, each (N,); (N, K). The constant function is in their span."""
         if self.kind == "periodic":
-            angles = arguments[0][:, None] * np.arange(1, HARMONICS + 1)
+            angles = arguments[0][:, None] * np.arange(1, self.harmonics + 1)
             return np.concatenate([np.ones((len(angles), 1)), np.cos(angles), np.sin(angles)], axis=1)
         hats = [_hats(values, np.array(knots)) for values, knots in zip(arguments, self.knots, strict=True)]
         columns = hats[0] if len(hats) == 1 else (hats[0][:, :, None] * hats[1][:, None, :]).reshape(len(hats[0]), -1)
@@ -219,8 +222,9 @@ def hypotheses(sites: Sites) -> list[Law]:
 
 def _basis(sites: Sites, places: Sequence[Place], kind: str) -> Basis | None:
     """Knots over the range of the arguments at all places; None where an argument hardly changes."""
-    if kind == "periodic":
-        return Basis(kind, (tuple(np.linspace(-np.pi, np.pi, 61).tolist()),))
+    if kind in ("periodic", "spot"):
+        turn = tuple(np.linspace(-np.pi, np.pi, 61).tolist())
+        return Basis("periodic", (turn,), harmonics=SPOT_HARMONICS if kind == "spot" else HARMONICS)
     knots: list[tuple[float, ...]] = []
     parts = np.linspace(0.005, 0.995, FLOOR_KNOTS if len(places[0].arguments) > 1 else KNOTS)
     for index in range(len(places[0].arguments)):
@@ -293,7 +297,7 @@ def _kinds(name: str) -> tuple[str, ...]:
     if name.startswith("steer_angle"):
         return ("periodic", "map")
     if name.startswith("drive_angle"):
-        return ("periodic",)
+        return ("periodic", "spot")
     return ("speed",) if "velocity" in name or name in ("v_x", "v_y", "omega") else ("map",)
 
 
