@@ -100,6 +100,13 @@ def cubic(state: PlantState, motor: np.ndarray) -> np.ndarray:
     return torque
 
 
+def quadratic(state: PlantState, motor: np.ndarray) -> np.ndarray:
+    """A drag in one steering that grows with the square of its speed; named viscous friction beside a law that ends too early."""
+    torque = np.zeros((4, 2))
+    torque[1, 1] = -0.03 * state.joint_velocity[1, 1] * abs(state.joint_velocity[1, 1])
+    return torque
+
+
 def hard_spot(state: PlantState, motor: np.ndarray) -> np.ndarray:
     """Friction at one place of the turn of one wheel; named a row of coggings by who does not look."""
     torque = np.zeros((4, 2))
@@ -154,6 +161,14 @@ def test_one_place_of_a_turn_is_no_row_of_coggings(tmp_path, monkeypatch):
     [unknown] = findings.unknown
     assert unknown.depends_on == ("drive_angle/rear_left", "drive_velocity/rear_left")
     assert unknown.share_explained > 0.8
+
+
+def test_a_quadratic_drag_is_no_viscous_friction_beside_it(tmp_path, monkeypatch):
+    """Its formula goes to the ends of what was seen, where a drag is largest: nothing is left there for another name."""
+    findings = analysed(record(tmp_path / "run", quadratic, 3, monkeypatch)).findings
+    assert (findings.verdict, findings.effects) == ("unexplained", ())
+    [unknown] = findings.unknown
+    assert unknown.depends_on == ("steer_velocity/front_right",)
 
 
 def loaded(effect: GeneratedEffect, folder: Path) -> Effect:

@@ -25,7 +25,7 @@ from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem
 from .shape_search import refined_shape
-from .unknown_law import Law
+from .unknown_law import Law, combined
 from .whitened_regression import Instance, WhitenedRegression
 
 HAT_KNOTS = 9
@@ -178,6 +178,7 @@ def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tup
     form = closed_form(found.law.basis, weights, covariance)
     if form is None:
         return *curve, found.law
+    form = _as_far_as_seen(search.problem, found.law, form)
     law = dataclasses.replace(found.law, basis=form)
     closed = _with_law(search, selection, law, found.names)
     valid = search.problem.valid
@@ -193,6 +194,14 @@ def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tup
         law = dataclasses.replace(found.law, basis=fourier(found.law.basis))
         return *_with_law(search, selection, law, found.names), law
     return *curve, found.law
+
+
+def _as_far_as_seen(problem: RegressionProblem, law: Law, form: ClosedForm) -> ClosedForm:
+    """Return a closed form that holds over all that was seen: its knots leave out the ends, where a drag is largest."""
+    if not form.clipped or problem.sites is None:
+        return form
+    seen = np.concatenate([combined(problem.sites.variables, place.arguments[0]) for place in law.places])
+    return dataclasses.replace(form, knots=((float(seen.min()), float(seen.max())),))
 
 
 def _without_what_names_hold(search: EffectSearch, selection: Selection, law: Law, form: ClosedForm) -> Law:
