@@ -101,7 +101,7 @@ def cubic(state: PlantState, motor: np.ndarray) -> np.ndarray:
 
 
 def quadratic(state: PlantState, motor: np.ndarray) -> np.ndarray:
-    """A drag in one steering that grows with the square of its speed; named viscous friction beside a law that ends too early."""
+    """A drag in one steering by the square of its speed; named viscous friction beside a law that ends too early."""
     torque = np.zeros((4, 2))
     torque[1, 1] = -0.03 * state.joint_velocity[1, 1] * abs(state.joint_velocity[1, 1])
     return torque
