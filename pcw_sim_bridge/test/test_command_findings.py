@@ -1,5 +1,8 @@
 """Between command and torque: lags and dead times of single joints, and what all joints of an axis have alike."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from pcw_description import load_robot
@@ -44,3 +47,17 @@ def test_one_joint_at_fault_is_named_alone():
 
 def test_nothing_is_named_where_commands_are_followed():
     assert found().named == ()
+
+
+def test_torques_logged_with_the_state_they_were_computed_from_are_no_dead_time():
+    """Another simulator's recordings: every drive was said to answer one period late, with certainty."""
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), ())
+    commands, joints = recording.joint_commands, recording.joint_states
+    held = np.searchsorted(commands.stamp, joints.stamp + 1e-6) - 1
+    noise = 0.02 * np.random.default_rng(1).standard_normal(joints.effort.shape)
+    logged = dataclasses.replace(joints, effort=commands.effort[held] + noise)
+    recording = dataclasses.replace(recording, joint_states=logged)
+    problems = command_problems(ROBOT, [recording])
+    assert command_findings(problems, (), 0, None, lambda message: None).named == ()
+    for problem in problems:
+        assert np.std(problem.residual) == pytest.approx(0.02, rel=0.05)

@@ -12,6 +12,7 @@ from pcw_sim_bridge.mismatch.effect_gates import (
     NOISY_PART,
     EffectGates,
 )
+from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
 
 CASTERS = ("a", "b", "c")
@@ -53,3 +54,27 @@ def test_half_a_torque_is_no_error_of_the_models_scale(times: float, curved: boo
     gates = EffectGates(problem, SelectionSettings())
     own = np.array([times * 0.01 * 3.0, 1.0])  # nothing is measured in the second channel, and nothing is told by it
     assert gates._beyond_scale([SimpleNamespace(term=0)], own) == beyond
+
+
+@pytest.mark.parametrize(
+    ("term", "passes"),
+    [
+        ({"is_exact": True}, True),
+        ({"is_exact": True, "is_curved": True}, False),
+        ({"is_exact": False}, False),
+        ({"is_exact": True, "effect": UNKNOWN}, False),
+    ],
+)
+def test_torques_at_joints_need_less_to_be_told_from_the_models_errors(term: dict[str, object], passes: bool) -> None:
+    """Smaller than what the model misjudges, and of a shape that its errors have not."""
+    term = {"effect": "friction", "target": ("a",), "noisy": False, "is_curved": False, **term}
+    settings = SelectionSettings()
+    problem = SimpleNamespace(
+        terms=[SimpleNamespace(**term)], scale_deviation=0.0, measured=np.ones((2, 1)), valid=np.ones((2, 1), dtype=bool),
+        misjudged=np.ones((2, 1)), drifts=np.ones((2, 1, 1)),
+    )
+    nats = 0.5 * (settings.least_peculiar_torque + settings.least_peculiar)
+    regression = SimpleNamespace(peculiar=lambda change: nats)
+    size, remains, none = np.array([0.5]), np.array([0.1]), np.array([0.0])
+    share = EffectGates(problem, settings)._share(regression, [SimpleNamespace(term=0)], size[:, None], size, (remains, none))
+    assert (share >= 1.0) == passes

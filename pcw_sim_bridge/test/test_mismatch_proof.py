@@ -24,6 +24,7 @@ from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, inte
 from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot
 from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
+from pcw_sim_bridge.mismatch.rollout import HORIZONS, Windows
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.plants.reduced import ReducedPlant, WindowStarts
 from pcw_sim_bridge.simulated_run import record_run
@@ -284,6 +285,24 @@ def test_below_its_floor_nothing_is_worse() -> None:
     errors = PairedErrors.of(before, 4.0 * before, np.arange(400) // 10, np.random.default_rng(4))
     assert errors.worse() == pytest.approx([1.0, 1.0])
     assert errors.worse(np.array([1.0, 0.64])) == pytest.approx([0.0, 0.25])
+
+
+@pytest.mark.parametrize(("with_it", "misleads"), [((0.1, 0.3, 0.5), False), ((0.1, 0.3, 1.1), True)])
+def test_an_effect_misleads_simulations_by_all_horizons_and_not_by_one(with_it: tuple[float, ...], misleads: bool) -> None:
+    """After half a second errors of two kinds may cancel without it: what follows less well then, but better later, stays."""
+    rng = np.random.default_rng(0)
+    spread = rng.uniform(0.9, 1.1, size=(60, len(HORIZONS), 1))
+    nominal, without, after = (
+        spread * np.array(errors)[:, None] ** 2 for errors in ((1.0, 2.0, 4.0), (0.1, 0.2, 1.0), with_it)
+    )
+    windows = Windows(("speed",), np.zeros(60, dtype=np.int64), 2.0 * np.arange(60), np.ones_like(spread), (((0, 1.0),),), ())
+    prover = SimpleNamespace(
+        before=nominal, rng=rng, _quiet_windows=lambda explanation: windows,
+        _simulation_tells=lambda explanation, instance: True, _rollout=lambda explanation, held_out, index: without,
+    )
+    held_out = SimpleNamespace(proposed=(0,), instances=(Instance(0, (), (0,)),))
+    found = Prover._misleading(prover, SimpleNamespace(), held_out, after)  # type: ignore[arg-type]
+    assert (found is not None) == misleads
 
 
 @pytest.mark.parametrize(("effect", "moves"), [("imu_lever_arm", False), ("clock_offset", False), ("payload_mass", True)])

@@ -375,6 +375,61 @@ def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
     assert 34 <= held <= 40
 
 
+@pytest.mark.parametrize("healthy", [-0.3, -0.1, 0.0, 0.2, 0.35])
+def test_an_interval_is_as_wide_as_the_tolerance_that_does_the_same(healthy):
+    """How much of what is turned is the effect, a zero known to 0.2 leaves open; its curvature does not say it."""
+    search = EffectSearch(turned_problem(1.2 + healthy, 0.2), np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.balanced(search.conclude(search.made_exact((Instance(0, (), (0,)),)), 5.0))
+    assert channel_deviations(search.residual_of(selection.fit.instances), search.problem.valid) == pytest.approx(
+        [0.1 * NOISE], rel=0.1
+    )
+    estimate = named_terms(search, selection)[0].estimates["offset"]
+    assert estimate.value == pytest.approx(1.2 + healthy, abs=0.03)
+    assert estimate.low <= 1.2 <= estimate.high
+    assert estimate.high - estimate.low == pytest.approx(2.0 * 1.96 * 0.2, rel=0.05)
+
+
+def test_a_parameter_that_stands_in_place_of_a_number_is_reported_whole():
+    """The number is off everywhere and where the effect is at work it is another: that value, not its distance from either."""
+    time = np.arange(3000) / RATE
+    everywhere, there = np.cos(0.3 * time) + np.sin(1.9 * time), np.sin(1.9 * time)
+    noise = 0.002 * np.random.default_rng(3).standard_normal(len(time))
+    problem = linear_problem(0.05 * everywhere + 0.2 * there + noise, {"longer": (there, 100.0)})
+    number = Nuisance("length", "m", 1.0, 0.05, everywhere[:, None])
+    parameter = LinearParameter("length", "m", -1.0, 9.0, 3.0, origin=1.0, number="length")
+    term = dataclasses.replace(problem.terms[0], parameters=(parameter,))
+    problem = dataclasses.replace(problem, nuisances=(number,), terms=(term,), scale_deviation=0.0)
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    estimate = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))[0].estimates["length"]
+    assert estimate.value == pytest.approx(1.25, abs=5e-4)
+    assert estimate.low <= 1.25 <= estimate.high
+    # The sine that both share is known to noise; apart they are known to sqrt(2) times that.
+    assert estimate.high - estimate.low == pytest.approx(2.0 * 1.96 * 0.002 / np.sqrt(len(time) / 2.0), rel=0.3)
+
+
+def test_an_exchange_that_does_not_last_leaves_the_selection_where_it_was(monkeypatch):
+    """Numbers, intervals and what held-out recordings say are asked at the place where the selection is exact."""
+    time = np.arange(3000) / RATE
+    column = np.sin(2.1 * time)
+    noise = NOISE * np.random.default_rng(4).standard_normal(len(time))
+    problem = linear_problem(2.0 * column + noise, {"one": (column, 100.0), "other": (column, 100.0)})
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.conclude((Instance(0, (), (0,)),), 5.0)
+    rival = Instance(1, (), (0,))
+
+    def elsewhere(chosen: Selection, threshold: float) -> Selection:
+        search.problem, search._point = dataclasses.replace(search.problem), {}
+        return selection
+
+    monkeypatch.setattr(search, "_alike", lambda chosen, others, own: [rival])
+    monkeypatch.setattr(search, "_exact_evidence", lambda regression, fit: 100.0 * (rival in fit.instances))
+    monkeypatch.setattr(search, "settle_on", elsewhere)
+    here = search.problem, search._point
+    assert search.against_alike(selection) is selection
+    assert search.problem is here[0]
+    assert search._point is here[1]
+
+
 def test_noise_in_its_columns_is_no_need_of_an_effect():
     """Without it a number would be eight tolerances off; but one with the residual's own noise has to be more than that."""
     time = np.arange(3000) / RATE

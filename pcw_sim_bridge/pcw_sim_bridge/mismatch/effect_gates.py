@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .noise_model import channel_deviations
-from .regression_problem import BoolArray, FloatArray, RegressionProblem
+from .regression_problem import UNKNOWN, BoolArray, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -142,10 +142,18 @@ class EffectGates:
         seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * remains, part), 1e-300)))
         if share >= 1.0 or seen < 1.0 or self.problem.drifts is None:
             return share
-        wanted = self.settings.least_peculiar
-        if own is None or not self._beyond_scale(instances, own):
-            wanted *= self._noise_factor(instances)
+        if all(self._at_joints(instance) for instance in instances):
+            wanted = self.settings.least_peculiar_torque
+        elif own is not None and self._beyond_scale(instances, own):
+            wanted = self.settings.least_peculiar
+        else:
+            wanted = self.settings.least_peculiar * self._noise_factor(instances)
         return max(share, min(seen, regression.peculiar(change) / wanted))
+
+    def _at_joints(self, instance: Instance) -> bool:
+        """Whether an effect of the library adds torques to joints, in proportion to its numbers."""
+        term = self.problem.terms[instance.term]
+        return term.is_exact and not term.is_curved and term.effect != UNKNOWN
 
     def _beyond_scale(self, instances: Sequence[Instance], own: FloatArray) -> bool:
         """Whether what is in proportion to something measured is more than any error of its scale, by itself (C,)."""

@@ -201,9 +201,11 @@ class EffectSearch:
                     continue
                 gain = evidence - own
                 self.progress(f"exchange {self.label(instance)} for {self.label(rival)}: {gain:.1f} nats where exact")
+                here = self.problem, self._point
                 instead = self.settle_on(self.conclude((*others, rival), selection.threshold), selection.threshold)
                 if any(found.term == rival.term for found in instead.fit.instances):
                     return instead
+                self.problem, self._point = here  # the selection is exact there
         return selection
 
     def _alike(self, selection: Selection, others: tuple[Instance, ...], own: Instance) -> list[Instance]:
@@ -223,6 +225,24 @@ class EffectSearch:
             if len(found) == MOST_ALIKE or candidate.gain < selection.losses[selection.fit.instances.index(own)] - FAR:
                 break
         return found
+
+    def balanced(self, selection: Selection) -> Selection:
+        """The selection with what an effect and a number of the description do alike shared out as their priors say.
+
+        By secant and slope they differ, and how much of it is whose would be told by that alone.
+        """
+        here, regression, tangent = (self.problem, self._point), selection.regression, self.problem.tangent()
+        if tangent is self.problem or self.problem.point is None:
+            return selection
+        self.problem = tangent
+        if self._exact_at(regression.moved(tangent).fit(selection.fit.instances)):
+            there = regression.moved(self.problem)
+            fit = there.fit(selection.fit.instances)
+            exact = dataclasses.replace(fit, mean=self._point_of(fit))
+            if there.cost(exact) <= regression.cost(selection.fit) + STEADY_EVIDENCE:
+                return dataclasses.replace(selection, regression=there, fit=exact)
+        self.problem, self._point = here
+        return selection
 
     def advantage(self, selection: Selection, instances: tuple[Instance, ...]) -> float:
         """Nats of a selection over other effects, both where they are exact."""

@@ -168,7 +168,8 @@ def explain(
             suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
             progress(f"not adopted: {suspect.describe()}")
     judgement = judge(search, selection)
-    search, selection, result = judgement.search, judgement.selection, judgement.result
+    search, result = judgement.search, judgement.result
+    selection = search.balanced(judgement.selection)
     problem = search.problem
     named = tuple(
         dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
@@ -245,7 +246,7 @@ def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection
 def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
     """Return the explanation by these effects alone: fitted again, and what is left tested again."""
     search, threshold = explanation.search, explanation.selection.threshold
-    selection = search.retuned_away(search.conclude(instances, threshold))
+    selection = search.balanced(search.retuned_away(search.conclude(instances, threshold)))
     instances = selection.fit.instances
     result = OpenSetTest(search, selection.fit.instances).run(threshold)
     return dataclasses.replace(
@@ -408,10 +409,13 @@ def _estimates(problem: RegressionProblem, fit: Fit) -> list[FloatArray]:
 def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, ...]:
     """Numbers, intervals, probability and look-alikes of every effect of a selection."""
     problem, regression, fit = search.problem, selection.regression, selection.fit
-    variance = np.maximum(np.diag(fit.covariance), 1e-300)
-    widening = np.maximum(np.diag(regression.misfit_covariance(fit)) / variance, 1.0)
-    deviation = np.sqrt(variance * widening)
-    position = len(problem.nuisances)
+    tangent = problem.tangent()
+    there = regression if tangent is problem else regression.moved(tangent)
+    known = there.fit(fit.instances)
+    misfit = there.misfit_covariance(known)
+    widening = np.maximum(np.diag(misfit) / np.maximum(np.diag(known.covariance), 1e-300), 1.0)
+    numbers = [nuisance.name for nuisance in problem.nuisances]
+    position = len(numbers)
     named = []
     for index, instance in enumerate(fit.instances):
         term = problem.terms[instance.term]
@@ -420,10 +424,11 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             parameter = term.parameters[parameter_index]
             if parameter.hidden:
                 continue
-            value = float(fit.mean[position + offset])
-            # The column of an effect that is not in proportion to its size is a secant, the slope there is steeper or less so.
+            parts = [position + offset, *(numbers.index(name) for name in numbers if name == parameter.number)]
+            value = float(fit.mean[parts].sum())
+            variance = max(float(covariance[np.ix_(parts, parts)].sum()) for covariance in (known.covariance, misfit))
             power = problem.powers.get((instance.term, instance.shape, parameter_index), 1.0)
-            half = HALF_WIDTH * math.hypot(float(deviation[position + offset]), problem.scale_deviation * value) / power
+            half = HALF_WIDTH * math.hypot(math.sqrt(variance), problem.scale_deviation * value / power)
             low, high = parameter.interval(value - half, value + half)
             estimates[parameter.name] = Estimate(parameter.value(value), parameter.unit, low, high)
         others = fit.instances[:index] + fit.instances[index + 1 :]

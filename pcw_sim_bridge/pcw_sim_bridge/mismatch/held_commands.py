@@ -9,24 +9,36 @@ from pcw_description.robot_description import RobotDescription
 
 from .regression_problem import FloatArray
 
+SAME_STAMP = 1e-6  # [s]
 LARGEST_GAP = 0.05  # [s]; an older command is not held any more
 # A motor follows its commands where what it reports is so many times the command.
 FOLLOWS = (0.8, 1.2)
+SURE = 5.0  # deviations of chance, by which one way to read the stamps must be nearer to what was reported than another
 
 
 def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray | None:
     """Return the command held by every joint at each stamp (T, n, 2) [N m], within its limit; NaN where there was none.
 
     None where no torques were commanded at all, or none reported.
+
+    What is reported at a stamp is the answer to the command before it. But who logs a state together with the torque that was
+    computed from it gives both the same stamp: then what is reported is nearer to the command of its own stamp, which no
+    motor can obey before it was given.
     """
     commands, joints = recording.joint_commands, recording.joint_states
     if commands is None or commands.effort is None or joints.effort is None or len(commands.stamp) < 2:
         return None
-    # What is reported at a stamp is the answer to the command before it.
-    held = np.searchsorted(commands.stamp, joints.stamp - 1e-6, side="left") - 1
-    fresh = (held >= 0) & (joints.stamp - commands.stamp[np.maximum(held, 0)] < LARGEST_GAP)
-    effort = np.clip(commands.effort[np.maximum(held, 0)], -robot.torque_limit, robot.torque_limit)
-    return np.where(fresh[:, None, None], effort, np.nan)
+
+    def held(latest: FloatArray) -> FloatArray:
+        last = np.searchsorted(commands.stamp, latest, side="left") - 1
+        fresh = (last >= 0) & (joints.stamp - commands.stamp[np.maximum(last, 0)] < LARGEST_GAP)
+        effort = np.clip(commands.effort[np.maximum(last, 0)], -robot.torque_limit, robot.torque_limit)
+        return np.where(fresh[:, None, None], effort, np.nan)
+
+    before, at = held(joints.stamp - SAME_STAMP), held(joints.stamp + SAME_STAMP)
+    nearer = (joints.effort - before) ** 2 - (joints.effort - at) ** 2
+    nearer = nearer[np.isfinite(nearer)]
+    return at if nearer.sum() > SURE * np.sqrt(np.sum(nearer**2)) else before
 
 
 def quiet_torque(robot: RobotDescription, recording: Recording) -> FloatArray | None:

@@ -28,6 +28,7 @@ IntArray = npt.NDArray[np.int64]
 CURVED_FROM = 0.01
 # The power of its size that an effect is in proportion to is taken from this part of it to all of it, within these.
 WEAKER, POWERS = 0.8, (0.5, 3.0)
+NEARBY = 0.01  # part of its size by which an effect is changed for its derivative there
 PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
 HEALTHY = 3.0  # tolerances
@@ -92,6 +93,8 @@ class LinearParameter:
         reciprocal: the coefficient is the inverse of the parameter's distance from `pole`, less that of the origin's;
             squared: it is its square.
         hidden: it is no number of the effect, only of how much of it there is.
+        number: of the description, by the nuisance's name, in whose place the parameter stands where the effect is at work:
+            its value is the number as it was re-tuned, and the coefficient besides.
     """
 
     name: str
@@ -105,6 +108,7 @@ class LinearParameter:
     pole: float = 0.0
     squared: bool = False
     hidden: bool = False
+    number: str = ""
 
     def value(self, coefficient: float) -> float:
         """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""
@@ -365,14 +369,14 @@ class RegressionProblem:
             return self
         known = {nuisance.name: nuisance for nuisance in self.nuisances}
         changes = {name: change for name, change in changes.items() if name in known}
-        found = self.exact(changes, [size for size in sizes if size.term < len(self.terms)])
+        found = self.exact(changes, self._held(sizes))
         if found is None:
             return self
         residual, taken = found
         columns: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = {}
         powers: dict[tuple[int, tuple[tuple[str, float], ...], int], float] = {}
         for index, size in enumerate(sizes):
-            if size.term < len(self.terms) and self.terms[size.term].is_exact:
+            if self._holds(size):
                 place = size.term, size.shape
                 columns[place], found_powers = self._secants(changes, sizes, index, residual)
                 powers |= {(*place, k): power for k, power in found_powers.items()}
@@ -397,7 +401,7 @@ class RegressionProblem:
         """Return the problem with the nuisances' columns as they are where it is exact, instead of at the description."""
         if self.derive is None or self.point is None:
             return self
-        columns = self.derive(self.point.changes, [size for size in self.point.sizes if size.term < len(self.terms)])
+        columns = self.derive(self.point.changes, self._held(self.point.sizes))
         if columns is None:
             return self
         residual, nuisances = self.residual, []
@@ -409,6 +413,52 @@ class RegressionProblem:
         moved = dataclasses.replace(self, residual=residual, nuisances=tuple(nuisances), point=point)
         moved._remembered.update(self._remembered)
         return moved
+
+    def tangent(self) -> RegressionProblem:
+        """Return the problem with all columns as they are where it is exact, for what numbers are known to there.
+
+        By a secant an effect differs from the number of the description that does the same: with precise sensors it would be
+        told from that number's tolerance by nothing but its curvature.
+        """
+        sizes = () if self.point is None else self.point.sizes
+        curved = [(index, size) for index, size in enumerate(sizes) if self._holds(size) and self.terms[size.term].is_curved]
+        if self.point is None or not curved:
+            return self
+        problem, at = self.derived(), (self.point.changes, sizes)
+        residual, found = problem.residual, {}
+        for index, size in curved:
+            before = problem.columns(size.term, size.shape)
+            columns = before.copy()
+            parameters = self.terms[size.term].parameters
+            for k, (parameter, coefficient) in enumerate(zip(parameters, size.coefficients, strict=True)):
+                if abs(coefficient) < CURVED_FROM * parameter.deviation:
+                    continue
+                less, more = (self._left(*at, index, k, part) for part in (1.0 - NEARBY, 1.0 + NEARBY))
+                if less is not None and more is not None:
+                    columns[:, :, k] = (less - more) / (2.0 * NEARBY * coefficient)
+            found[size.term, size.shape] = columns
+            residual = residual + (columns - before) @ size.coefficients
+        moved = dataclasses.replace(problem, residual=residual, powers={})
+        moved._remembered.update(problem._remembered | found)
+        return moved
+
+    def _holds(self, size: SizedTerm) -> bool:
+        """Whether the exact residual holds an effect; laws that came later are not in it."""
+        return size.term < len(self.terms) and self.terms[size.term].is_exact
+
+    def _held(self, sizes: Sequence[SizedTerm]) -> list[SizedTerm]:
+        return [size for size in sizes if self._holds(size)]
+
+    def _left(
+        self, changes: Mapping[str, float], sizes: Sequence[SizedTerm], index: int, k: int, part: float
+    ) -> FloatArray | None:
+        """Residual (T, C) of the model with a part of one parameter of one effect, and all others at work."""
+        assert self.exact is not None
+        coefficients = sizes[index].coefficients.copy()
+        coefficients[k] *= part
+        others = [*sizes[:index], dataclasses.replace(sizes[index], coefficients=coefficients), *sizes[index + 1 :]]
+        found = self.exact(changes, self._held(others))
+        return None if found is None else found[0]
 
     def _secants(
         self, changes: Mapping[str, float], sizes: Sequence[SizedTerm], index: int, residual: FloatArray
@@ -423,19 +473,10 @@ class RegressionProblem:
         if not term.is_curved:
             return columns, powers
         columns = columns.copy()
-
-        def scaled(k: int, part: float) -> FloatArray | None:
-            changed = size.coefficients.copy()
-            changed[k] *= part
-            others = [*sizes[:index], dataclasses.replace(size, coefficients=changed), *sizes[index + 1 :]]
-            assert self.exact is not None
-            found = self.exact(changes, [other for other in others if other.term < len(self.terms)])
-            return None if found is None else found[0]
-
         for k, (parameter, coefficient) in enumerate(zip(term.parameters, size.coefficients, strict=True)):
             if abs(coefficient) < CURVED_FROM * parameter.deviation:
                 continue
-            without, weaker = scaled(k, 0.0), scaled(k, WEAKER)
+            without, weaker = (self._left(changes, sizes, index, k, part) for part in (0.0, WEAKER))
             if without is None or weaker is None:
                 continue
             work = without - residual

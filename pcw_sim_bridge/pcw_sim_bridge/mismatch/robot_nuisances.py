@@ -248,7 +248,7 @@ def _tyres(robot: RobotDescription) -> Iterator[Deviation]:
     length = robot.contact.relaxation_length
 
     def relaxation(numbers: ModelNumbers, step: float) -> None:
-        numbers.tyres[:, LENGTH] *= 1.0 + step / length
+        numbers.tyres[:, LENGTH] += step
 
     yield "contact.relaxation_length", "contact.relaxation_length", length, relaxation
     for i, caster in enumerate(robot.caster_names):

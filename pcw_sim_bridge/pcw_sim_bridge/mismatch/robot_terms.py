@@ -405,4 +405,5 @@ def _linear(parameter: EffectParameter, neutral: float, room: float) -> LinearPa
     return LinearParameter(
         parameter.name, parameter.unit, parameter.lower - neutral, parameter.upper - neutral,
         max(3.0 * parameter.typical, room), origin=neutral,
+        number=parameter.neutral if isinstance(parameter.neutral, str) else "",
     )

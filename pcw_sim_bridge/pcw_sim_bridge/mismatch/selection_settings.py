@@ -20,6 +20,7 @@ class SelectionSettings:
             large effect is itself only known so well, and its error must not be named a further effect.
         least_peculiar: nats that a term smaller than what the model misjudges must have beside the model's own errors. What
             healthy robots in other simulations than the model were given wrongly stayed below half of it.
+        least_peculiar_torque: the same of torques at joints, which were given wrongly to none of them with 20.
         blocks: of the cross-validation.
         first_repeats: instances of a repeatable term in the first over-complete set; more would eat red noise line by line.
     """
@@ -30,6 +31,7 @@ class SelectionSettings:
     smallest_share: float = 0.25
     smallest_part: float = 0.02
     least_peculiar: float = 100.0
+    least_peculiar_torque: float = 50.0
     blocks: int = 10
     surrogates: int = 200
     largest_set: int = 16

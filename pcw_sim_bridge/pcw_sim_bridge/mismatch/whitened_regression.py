@@ -366,6 +366,11 @@ class WhitenedRegression:
         mean[:count] += steps * deviations
         return dataclasses.replace(self.fit(others), mean=mean)
 
+    def cost(self, fit: Fit) -> float:
+        """Half the squared error of a fit's numbers, and half their squared distance from what is expected of them [nats]."""
+        error = float(np.sum(self.whitened_residual(fit) ** 2))
+        return 0.5 * (error + float(np.sum((fit.mean / self.deviations(fit.instances)) ** 2)))
+
     def tolerance_cost(self, fit: Fit) -> float:
         """Half the squared distance of the description's numbers from nominal, in tolerances [nats]."""
         count = len(self.problem.nuisances)
