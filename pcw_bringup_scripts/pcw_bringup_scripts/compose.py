@@ -1,6 +1,7 @@
 """Runs several nodes in one process and one events executor: the cheapest way to run a robot's nodes on one computer.
 
     compose bridge computed_torque odometry encoder_slip --ros-args -p computed_torque:goal_speed:=0.3 -p robot:=thesis
+    compose bridge computed_torque --help      the parameters of these nodes
 
 Parameters without a node's name go to all nodes (`-p robot:=thesis`); with it, to that one.
 """
@@ -51,14 +52,22 @@ def main(args: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if args is None else args)
     split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     names, ros_arguments = arguments[:split], arguments[split:]
-    if not names or names[0] in ("-h", "--help"):
-        print(f"{__doc__.strip()}\n\nNodes: {', '.join(NODES)}")
-        return 0 if names else 2
+    wants_help = any(argument in ("-h", "--help") for argument in arguments)
+    if wants_help:
+        names = [name for name in names if name not in ("-h", "--help")]
+    if not names:
+        print(f"{__doc__.strip()}\n\nNodes: {', '.join(NODES)}", file=sys.stdout if wants_help else sys.stderr)
+        return 0 if wants_help else 2
     try:
         factories = node_factories(names)
     except ValueError as error:
         print(f"compose: {error}", file=sys.stderr)
         return 2
+    if wants_help:
+        from pcw_description.nodes.node_help import HOW_TO_GIVE, parameter_table
+
+        print("\n\n".join([HOW_TO_GIVE, *(f"{name}\n{parameter_table(node)}" for name, node in zip(names, factories))]))
+        return 0
     from pcw_description.nodes.node_tools import run_nodes
 
     return run_nodes(factories, ros_arguments)

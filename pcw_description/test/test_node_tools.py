@@ -15,7 +15,6 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from rclpy.context import Context  # noqa: E402
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
@@ -24,6 +23,7 @@ from pcw_description.errors import PcwError  # noqa: E402
 from pcw_description.nodes.node_tools import (  # noqa: E402
     Silence,
     StampWatch,
+    all_declared,
     declare,
     fill_joint_state,
     joint_state_arrays,
@@ -101,14 +101,18 @@ def test_descriptors_say_unit_and_range(context: Context) -> None:
 
 
 def test_overrides_are_taken_or_refused_when_declared(context: Context) -> None:
-    node = make_node(context, rate=50.0, names=["a"], mode="fats", count=1.0)
+    node = make_node(context, rate=50.0, names=["a"], mode="fats", count=1.0, far=9.0, whole=7)
     assert declare(node, "rate", 100.0, "how often") == 50.0
     assert declare(node, "names", Parameter.Type.STRING_ARRAY, "names") == ["a"]
     assert declare(node, "others", Parameter.Type.STRING_ARRAY, "names") == []
-    with pytest.raises(InvalidParameterValueException, match="did you mean 'fast'"):
+    with pytest.raises(PcwError, match="parameter mode: 'fats' is not known; did you mean 'fast'"):
         declare(node, "mode", "slow", "how", choices=("slow", "fast"))
-    with pytest.raises(InvalidParameterTypeException, match="expecting type 'INTEGER'"):
+    with pytest.raises(PcwError, match="parameter count: 1.0 is of type double; allowed: integer$"):
         declare(node, "count", 1, "how many")
+    with pytest.raises(PcwError, match=r"parameter far: 9.0 is outside 0.0 .. 5.0 m$"):
+        declare(node, "far", 1.0, "how far", "m", (0.0, 5.0))
+    with pytest.raises(PcwError, match="parameter whole: 7 is of type integer; allowed: double; write 7.0$"):
+        declare(node, "whole", 1.0, "a number")
     node.destroy_node()
 
 
@@ -179,14 +183,17 @@ import gc
 import inspect
 import sys
 from pcw_description.errors import PcwError
-from pcw_description.nodes.node_tools import declare, run_node
+from pcw_description.nodes.node_tools import all_declared, declare, run_node
 from rclpy.node import Node
 from std_msgs.msg import String
 
 class Probe(Node):
     def __init__(self):
         super().__init__("probe")
-        kind = declare(self, "kind", "runs", "what to do")
+        kind = declare(self, "kind", "runs", "what to do", choices=("runs", "ends", "breaks", "bad input"))
+        declare(self, "speed", 1.0, "how fast", "m/s", (0.0, 2.0), read_only=True)
+        all_declared(self)
+        print("made", flush=True)
         self.finished = False
         self.words = self.create_publisher(String, "words", 10)
         if kind == "bad input":
@@ -209,9 +216,9 @@ sys.exit(run_node(Probe))
 """
 
 
-def start_probe(*arguments: str) -> subprocess.Popen[str]:
+def start_probe(*arguments: str, before: tuple[str, ...] = ()) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, "--ros-args", *arguments],
+        [sys.executable, "-c", PROGRAM, *before, "--ros-args", *arguments],
         env={**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(DOMAIN)},
         text=True,
         stdout=subprocess.PIPE,
@@ -225,7 +232,7 @@ def start_probe(*arguments: str) -> subprocess.Popen[str]:
 def test_a_signal_ends_a_node_in_order(number: signal.Signals) -> None:
     """It can still publish in close(), and the exit code is 0; a Ctrl-C delivered twice changes nothing."""
     process = start_probe("-p", "knd:=typo")
-    assert process.stdout is not None and process.stdout.readline() == "working\n"
+    assert process.stdout is not None and process.stdout.readline() == "made\n" and process.stdout.readline() == "working\n"
     process.send_signal(number)
     process.send_signal(number)
     output, errors = process.communicate(timeout=DEADLINE)
@@ -255,6 +262,53 @@ def test_exit_codes(kind: str, code: int, said: str, closed: bool) -> None:
 def test_nothing_that_can_be_done_before_is_done_in_the_middle_of_a_period() -> None:
     """What a node needs all its life is left out of garbage collections, and a first warning need not search all modules."""
     output, errors = start_probe("-p", "kind:=ends").communicate(timeout=DEADLINE)
-    kept, collected, found, modules = map(int, output.split("\n")[0].split())
+    kept, collected, found, modules = map(int, output.split("\n")[1].split())
     assert kept > 20 * collected, errors
     assert found > 0.5 * modules
+
+
+# --- The command line -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("argument", ["-h", "--help"])
+def test_help_names_every_parameter_and_makes_no_node(argument: str) -> None:
+    process = start_probe("-p", "kind:=breaks", before=(argument,))
+    output, errors = process.communicate(timeout=DEADLINE)
+    assert (process.returncode, errors) == (0, "")
+    assert "made" not in output
+    assert "--ros-args -p NAME:=VALUE" in output
+    assert "  kind   string  default runs; one of runs, ends, breaks, bad input\n                 what to do\n" in output
+    assert "  speed  double  default 1.0 m/s; 0 to 2; fixed\n                 how fast\n" in output
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (("--kind", "ends"), (), "argument '--kind' is not allowed; did you mean --ros-args -p kind:=ends ?"),
+        (("--kind=ends",), (), "argument '--kind=ends' is not allowed; did you mean --ros-args -p kind:=ends ?"),
+        (("-p", "knd:=ends"), (), "argument '-p' is not allowed; did you mean --ros-args -p kind:=ends ?"),
+        (("speed:=2",), (), "argument 'speed:=2' is not allowed; did you mean --ros-args -p speed:=2.0 ?"),
+        (("words:=said",), (), "argument 'words:=said' is not allowed; did you mean --ros-args -r words:=said ?"),
+        (("x",), (), "argument 'x' is not allowed; allowed: parameters, as --ros-args -p NAME:=VALUE; --help lists them"),
+        ((), ("-p", "kind"), "arguments after --ros-args: "),
+        ((), ("--kind",), "arguments after --ros-args: "),
+        ((), ("--params-file", "is_not_there.yaml"), "is_not_there.yaml"),
+        ((), ("-p", "kind:=bad"), "parameter kind: 'bad' is not known; did you mean 'bad input'?"),
+    ],
+)
+def test_an_argument_that_is_none_is_refused_with_the_form_that_was_meant(
+    before: tuple[str, ...], after: tuple[str, ...], said: str
+) -> None:
+    """They were ignored without a word, and those after --ros-args gave a traceback."""
+    process = start_probe(*after, before=before)
+    output, errors = process.communicate(timeout=DEADLINE)
+    assert (process.returncode, output) == (2, ""), errors
+    assert said in errors and errors.count("\n") == 1
+
+
+def test_a_parameter_that_help_would_not_show_is_a_mistake(context: Context) -> None:
+    node = make_node(context)
+    all_declared(node)
+    with pytest.raises(TypeError, match="'late' is declared after all_declared"):
+        declare(node, "late", 1.0, "too late")
+    node.destroy_node()

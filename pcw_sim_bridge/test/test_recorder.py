@@ -285,9 +285,9 @@ def test_an_existing_path_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     ("parameter", "reason"),
     [
         ("compression:=zip", "'zip' is not known"),
-        ("max_duration:=-1.0", "out of range"),
-        ("max_duration:=.nan", "out of range"),
-        ("max_duration:=5", "expecting type 'DOUBLE'"),
+        ("max_duration:=-1.0", "max_duration: -1.0 is outside 0.0 .. 10000000.0 s"),
+        ("max_duration:=.nan", "max_duration: nan is not a finite number"),
+        ("max_duration:=5", "max_duration: 5 is of type integer; allowed: double; write 5.0"),
     ],
 )
 def test_a_bad_parameter_is_refused_with_the_reason(tmp_path: Path, parameter: str, reason: str) -> None:

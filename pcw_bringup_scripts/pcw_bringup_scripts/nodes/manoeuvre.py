@@ -19,6 +19,7 @@ from pcw_description.errors import PcwError
 from pcw_description.nodes.node_tools import (
     COMMAND_SOURCE,
     SENSOR,
+    all_declared,
     declare,
     run_node,
     stamp_to_ns,
@@ -51,6 +52,7 @@ class ManoeuvreNode(Node):
         self._patience = declare(
             self, "patience", 60.0, "give up after so long in vain, real time", "s", (1.0, 3600.0), read_only=True
         )
+        all_declared(self)
         self._manoeuvre = read_excitation(name, load_robot(robot), duration or None, seed)
         self._period_ns = round(1e9 / rate)
         self._start_ns: int | None = None

@@ -23,6 +23,7 @@ from pcw_description.nodes.node_tools import (
     COMMAND,
     COMMAND_SOURCE,
     SENSOR_SOURCE,
+    all_declared,
     declare,
     fill_joint_state,
     ns_to_stamp,
@@ -46,11 +47,13 @@ class _ComposedController(ControllerNode):
 class LatencyNode(Node):
     """Asks and takes the time."""
 
-    def __init__(self, controller: _ComposedController) -> None:
+    def __init__(self, made: list[_ComposedController]) -> None:
         super().__init__("command_latency")
-        self._controller, robot = controller, controller.robot
         rate: float = declare(self, "rate", 500.0, "rate of joint_states", "Hz", (1.0, 2000.0), read_only=True)
         self._cycles: int = declare(self, "cycles", 10_000, "answers that are counted", "", (100, 10_000_000), read_only=True)
+        all_declared(self)
+        (self._controller,) = made
+        robot = self._controller.robot
         self._period_ns = round(1e9 / rate)
         self._rates = inverse_kinematics(robot, np.zeros(robot.n), TWIST)
         self._position = np.zeros((robot.n, 2))
@@ -112,7 +115,7 @@ def main(args: Sequence[str] | None = None) -> int:
         made.append(_ComposedController())
         return made[0]
 
-    return run_nodes([controller, lambda: LatencyNode(made[0])], args)
+    return run_nodes([controller, lambda: LatencyNode(made)], args)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""The controller as a lifecycle node: cmd_vel or goal_pose and joint_states in, joint_commands out."""
+"""The controller as a lifecycle node: cmd_vel or goal_pose and joint_states in, joint_commands out.
+
+Gains follow from the robot: in the help their defaults are those of `thesis`, and a value that is given counts instead.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,7 @@ from pcw_description.nodes.node_tools import (
     SENSOR,
     Silence,
     StampWatch,
+    all_declared,
     declare,
     fill_joint_state,
     joint_state_arrays,
@@ -80,6 +84,7 @@ class ControllerNode(RobustLifecycleNode):
             check=self._reason_against,
         )
         declare_controller_parameters(self, robot)
+        all_declared(self)
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
         self._message = JointState(name=list(robot.joint_names))
         self._faults = self._timeouts = self._refused = self._switches = 0

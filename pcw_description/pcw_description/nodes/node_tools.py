@@ -6,6 +6,8 @@ A node's file needs no more than this:
         def __init__(self) -> None:
             super().__init__("odometry")
             self._rate = declare(self, "rate", 100.0, "publishing rate", unit="Hz", range=(1.0, 1000.0))
+            all_declared(self)                 # nothing is made before this, as `--help` comes so far
+            self._odom = self.create_publisher(Odometry, "odom", SENSOR_SOURCE)
 
         def close(self) -> None:               # optional: last words while publishing still works
             self._commands.publish(zero_torque)
@@ -18,11 +20,13 @@ A node's file needs no more than this:
 from __future__ import annotations
 
 import array
+import dataclasses
 import inspect
 import math
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -31,13 +35,14 @@ from builtin_interfaces.msg import Time
 from numpy.typing import ArrayLike
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.duration import Duration
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import JointState
 
 from pcw_description.errors import PcwError, nearest_name
@@ -62,9 +67,10 @@ LAST_WORDS = 1.0  # the longest that a node which ends waits for its listeners t
 def run_node(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Make the node, spin it until a signal or a shutdown, close and destroy it. Returns the exit code.
 
-    0 after SIGINT, SIGTERM or a shutdown from outside; 2 with one line on stderr for bad input (`PcwError`, a
-    refused parameter); 1 with a traceback for anything else. A node that has an end of its own sets `finished`.
-    A node's `close()` runs first of all, while it can still publish, also after an exception.
+    0 after SIGINT, SIGTERM or a shutdown from outside, and after `--help`; 2 with one line on stderr for bad input
+    (`PcwError`, a refused parameter, an argument that ROS does not take); 1 with a traceback for anything else. A node
+    that has an end of its own sets `finished`. A node's `close()` runs first of all, while it can still publish, also
+    after an exception.
     """
     return run_nodes([factory], args)
 
@@ -72,16 +78,22 @@ def run_node(factory: Callable[[], Node], args: Sequence[str] | None = None) -> 
 def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
     """As `run_node`, for several nodes in one process and one executor."""
     one_thread()
+    factories, arguments = list(factories), list(sys.argv[1:] if args is None else args)
+    exit_code = _answer_without_nodes(factories, arguments)
+    if exit_code is not None:
+        return exit_code
     # rclpy's own signal handlers invalidate the context at once, so that no last command (zero torque) could
     # be sent and no file be closed in order: ours only take a note.
-    rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Node] = []
     exit_code = 0
     with stop_requests() as stops:
         try:
             for factory in factories:
                 nodes.append(factory())
-                _warn_of_unknown_overrides(nodes[-1])
+                if not hasattr(nodes[-1], _ALL_DECLARED_ATTRIBUTE):
+                    raise TypeError(f"{type(nodes[-1]).__name__} does not say all_declared(self) after its parameters")
+            _warn_of_unknown_overrides(nodes)
             _spin(nodes, stops)
         except (KeyboardInterrupt, ExternalShutdownException):
             pass
@@ -97,6 +109,41 @@ def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | Non
                 node.destroy_node()
             rclpy.try_shutdown()
     return exit_code
+
+
+def _answer_without_nodes(factories: Sequence[Callable[[], Node]], arguments: Sequence[str]) -> int | None:
+    """Answer `--help` and arguments that nobody takes; None where the nodes are to be run."""
+    if "-h" in arguments or "--help" in arguments:
+        from .node_help import help_text
+
+        print(help_text(factories))
+        return 0
+    others = _outside_ros_args(arguments)
+    if others:
+        from .node_help import refusal
+
+        print(f"{_program_name()}: {refusal(others, factories)}", file=sys.stderr)
+        return 2
+    try:
+        remove_ros_args(arguments)  # reads them all
+    except RuntimeError as error:
+        said = str(error).partition(", at /")[0]  # without the lines of the sources of ROS
+        print(f"{_program_name()}: arguments after --ros-args: {said}; see --help", file=sys.stderr)
+        return 2
+    return None
+
+
+def _outside_ros_args(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments that are not between --ros-args and --; ROS still takes some of them, as it once did."""
+    outside, ours = [], True
+    for argument in arguments:
+        if argument == "--ros-args":
+            ours = False
+        elif not ours and argument == "--":
+            ours = True
+        elif ours:
+            outside.append(argument)
+    return outside
 
 
 def _spin(nodes: Sequence[Node], stops: Sequence[float]) -> None:
@@ -158,7 +205,54 @@ def _program_name() -> str:
 # --- Parameters -----------------------------------------------------------------------------------------
 
 Check = Callable[[Any], str | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class DeclaredParameter:
+    """What `declare` was told of a parameter."""
+
+    name: str
+    default: Any
+    description: str
+    unit: str
+    range: tuple[float, float] | None
+    read_only: bool
+    choices: Sequence[Any] | None
+
+
+class AllDeclared(Exception):
+    """Ends the constructor of a node of which only the parameters are wanted."""
+
+
+_sketch: list[DeclaredParameter] | None = None  # where declarations go while no node is behind them
+
+
+@contextmanager
+def sketch() -> Iterator[list[DeclaredParameter]]:
+    """Collect what nodes declare, at no node; `all_declared` raises AllDeclared meanwhile."""
+    global _sketch
+    _sketch = []
+    try:
+        yield _sketch
+    finally:
+        _sketch = None
+
+
+def all_declared(node: Node) -> None:
+    """Say that a node has declared its parameters: what it makes, opens or publishes comes after this."""
+    if _sketch is not None:
+        raise AllDeclared
+    setattr(node, _ALL_DECLARED_ATTRIBUTE, True)
+
+
+def type_name(value: Any) -> str:
+    """Return the ROS name of the type of a parameter's value, or of a type: double, string_array."""
+    kind = value if isinstance(value, Parameter.Type) else Parameter.Type.from_parameter_value(value)
+    return str(kind.name.lower())
+
+
 _CHECKS_ATTRIBUTE = "_pcw_parameter_checks"
+_ALL_DECLARED_ATTRIBUTE = "_pcw_all_declared"
 
 
 def declare(
@@ -177,9 +271,16 @@ def declare(
     The type is that of `default`; for an empty list give the type itself, `Parameter.Type.STRING_ARRAY`, and
     the value without an override is []. A value that is not finite, out of `range` (ends included), not
     among `choices`, or for which `check(value)` returns a reason is refused with that reason, now and
-    later, and the old value stays. A bad override raises rclpy's InvalidParameterValueException or
-    InvalidParameterTypeException.
+    later, and the old value stays.
+
+    Raises:
+        PcwError: the value given at the start is of another type, or refused.
     """
+    if _sketch is not None:
+        _sketch.append(DeclaredParameter(name, default, description, unit, range, read_only, choices))
+        return [] if isinstance(default, Parameter.Type) else default
+    if hasattr(node, _ALL_DECLARED_ATTRIBUTE):
+        raise TypeError(f"{name!r} is declared after all_declared, and so is not in the help of the node")
     descriptor = ParameterDescriptor(
         description=f"{description} [{unit}]" if unit else description, read_only=read_only
     )
@@ -187,11 +288,25 @@ def declare(
         _set_range(descriptor, default, range)
     if choices is not None:
         descriptor.additional_constraints = "one of " + ", ".join(str(choice) for choice in choices)
-    _checks_of(node)[name] = _combined_check(unit, range, choices, check)
-    if not isinstance(default, Parameter.Type):
-        return node.declare_parameter(name, default, descriptor).value
-    parameter = node.declare_parameter(name, default, descriptor)
-    return [] if parameter.value is None else parameter.value
+    check_all = _checks_of(node)[name] = _combined_check(unit, range, choices, check)
+    try:
+        value = node.declare_parameter(name, default, descriptor).value
+    except InvalidParameterTypeException:
+        raise PcwError(f"parameter {name}: {_wrong_type(_given(node, name), default)}") from None
+    except InvalidParameterValueException as error:
+        raise PcwError(f"parameter {name}: {check_all(_given(node, name)) or error}") from None
+    return [] if value is None else value
+
+
+def _given(node: Node, name: str) -> Any:
+    """Return the value that a parameter was given at the start."""
+    return node._parameter_overrides[name].value
+
+
+def _wrong_type(value: Any, default: Any) -> str:
+    """Return why a value of another type than that of the default is refused."""
+    example = f"; write {value}.0" if type_name(default) == "double" and type_name(value) == "integer" else ""
+    return f"{value!r} is of type {type_name(value)}; allowed: {type_name(default)}{example}"
 
 
 def _set_range(descriptor: ParameterDescriptor, default: Any, range: tuple[float, float]) -> None:  # noqa: A002
@@ -247,17 +362,20 @@ def _checks_of(node: Node) -> dict[str, Check]:
     return installed
 
 
-def _warn_of_unknown_overrides(node: Node) -> None:
-    """Say which given parameters the node does not know.
+def _warn_of_unknown_overrides(nodes: Sequence[Node]) -> None:
+    """Say which given parameters no node of the process knows.
 
-    A warning and not an error, because a parameter file with `/**` is read by every node of the process.
+    A warning and not an error, because a parameter file with `/**` is read by every node of a robot.
     """
-    overrides: Mapping[str, Parameter] = getattr(node, "_parameter_overrides", {})
-    for name in overrides:
-        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
-            known = getattr(node, _CHECKS_ATTRIBUTE, {})
-            hint = f"; {nearest_name(name, known)}" if known else ""
-            node.get_logger().warning(f"parameter {name!r} is unknown to this node and ignored{hint}")
+    known = {name for node in nodes for name in _checks_of(node)}
+    warned = set()
+    for node in nodes:
+        overrides: Mapping[str, Parameter] = getattr(node, "_parameter_overrides", {})
+        for name in overrides:
+            if not (node.has_parameter(name) or name in known | warned or name.startswith("qos_overrides.")):
+                warned.add(name)
+                hint = f"; {nearest_name(name, known)}" if known else ""
+                node.get_logger().warning(f"parameter {name!r} is unknown to this node and ignored{hint}")
 
 
 # --- Stamps ---------------------------------------------------------------------------------------------

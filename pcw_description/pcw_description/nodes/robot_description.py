@@ -12,7 +12,7 @@ from std_msgs.msg import String
 
 from ..robot_file import load_robot
 from ..urdf import robot_urdf
-from .node_tools import LATCHED, declare, run_node
+from .node_tools import LATCHED, all_declared, declare, run_node
 
 
 class RobotDescriptionNode(Node):
@@ -25,6 +25,7 @@ class RobotDescriptionNode(Node):
     def __init__(self) -> None:
         super().__init__("robot_description")
         name = declare(self, "robot", "thesis", "robot description: a .yaml file or a shipped robot", read_only=True)
+        all_declared(self)
         robot = load_robot(name)
         self._publisher = self.create_publisher(String, "robot_description", LATCHED)
         self._publisher.publish(String(data=robot_urdf(robot)))

@@ -19,7 +19,16 @@ from ..frame_tree import Frame, PoseTrack, drift_of_odometry, planar_frame, robo
 from ..robot_description import DRIVE, STEER
 from ..robot_file import load_robot
 from .diagnostics import OK, WARN, Diagnostics, Problems, Status
-from .node_tools import SENSOR, SENSOR_STREAM, declare, joint_state_arrays, ns_to_stamp, run_node, stamp_to_ns
+from .node_tools import (
+    SENSOR,
+    SENSOR_STREAM,
+    all_declared,
+    declare,
+    joint_state_arrays,
+    ns_to_stamp,
+    run_node,
+    stamp_to_ns,
+)
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -41,8 +50,6 @@ class TransformsNode(Node):
 
     def __init__(self) -> None:
         super().__init__("transforms")
-        if TFMessage is None:
-            raise PcwError("transforms need the package tf2_msgs, which is not installed; it comes with a ROS 2 installation")
         self.robot = load_robot(declare(self, "robot", "thesis", "robot file, or the name of a shipped robot", read_only=True))
         rate = declare(self, "rate", 50.0, "rate of the transforms, real time", "Hz", (1.0, 1000.0), read_only=True)
         joints = declare(self, "joints", True, "publish the links; not beside a robot_state_publisher", read_only=True)
@@ -51,6 +58,9 @@ class TransformsNode(Node):
             "odom: odom -> base_link; ground_truth: map -> base_link; drift: map -> odom, if others publish odom -> base_link",
             read_only=True, choices=tuple(BASES),
         )  # fmt: skip
+        all_declared(self)
+        if TFMessage is None:
+            raise PcwError("transforms need the package tf2_msgs, which is not installed; it comes with a ROS 2 installation")
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
         self._joint_states: JointState | None = None
         self._poses: dict[str, Odometry] = {}  # the newest by topic, until used

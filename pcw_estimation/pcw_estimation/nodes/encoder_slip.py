@@ -18,6 +18,7 @@ from pcw_description.nodes.node_tools import (
     Decimator,
     Silence,
     StampWatch,
+    all_declared,
     declare,
     joint_state_arrays,
     run_node,
@@ -56,6 +57,7 @@ class EncoderSlipNode(Node):
         declare(self, "steering_length", _DEFAULTS.steering_length, "projection: residual per steering rate", "m", (0.0, 0.1))
         declare(self, "confirm_time", _DEFAULTS.confirm_time, "how long slip, and its end, must last", "s", (0.0, 10.0))
         declare(self, "ratio_speed", _DEFAULTS.ratio_speed, "least speed that ratio and angle refer to", "m/s", (1e-3, 10.0))
+        all_declared(self)
         self._adopt_parameters()
         self.add_post_set_parameters_callback(lambda _: self._adopt_parameters())
         self._faults = FaultIsolation(self.robot, self._noise) if isolates and self._method != "projection" else None

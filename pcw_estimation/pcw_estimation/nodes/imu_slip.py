@@ -24,10 +24,10 @@ class ImuSlipNode(Node):
         self.robot = load_robot(declare(self, "robot", "thesis", "robot file, or the name of a shipped robot", read_only=True))
         rate = declare(self, "publish_rate", 100.0, "rate of slip/imu", "Hz", (0.1, 1e4), read_only=True)
         self._decimator = Decimator(rate)
-        self._topic = SlipTopic(self, "slip/imu", self.robot)
         self._motion: Motion | None = None
         self._all_slip = False
-        self._stream = ImuStream(self, self.robot, self._on_motion)
+        self._stream = ImuStream(self, self.robot, self._on_motion)  # declares the rest
+        self._topic = SlipTopic(self, "slip/imu", self.robot)
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="slip")
 
     def _on_motion(self, stamp: Time, dt: float | None, motion: Motion) -> None:

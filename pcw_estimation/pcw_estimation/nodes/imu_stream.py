@@ -15,6 +15,7 @@ from pcw_description.nodes.node_tools import (
     SENSOR_STREAM,
     Silence,
     StampWatch,
+    all_declared,
     declare,
     joint_state_arrays,
     stamp_to_ns,
@@ -62,6 +63,7 @@ class ImuStream:
         longest_gap = declare(
             node, "longest_gap", 0.5, "longest time between joint_states that is bridged", "s", (0.001, 60.0), read_only=True
         )
+        all_declared(node)
         self.filter = ImuSlip(
             robot, noise, ConfirmParameters(confirm_time, confirm_time, ratio_speed), ImuSlipParameters(timeout, yield_time)
         )

@@ -19,6 +19,7 @@ from pcw_description.nodes.node_tools import (
     Decimator,
     Silence,
     StampWatch,
+    all_declared,
     declare,
     joint_state_arrays,
     run_node,
@@ -57,6 +58,7 @@ class OdometryNode(Node):
         longest_gap = declare(
             self, "longest_gap", 0.5, "longest time between joint_states that is bridged", "s", (0.001, 60.0), read_only=True
         )
+        all_declared(self)
         self._parameters_of_odometry = odometry.OdometryParameters(method, memory)
         self._state = odometry.initial_state()
         self._watch, self._twist = StampWatch(longest_gap), np.zeros(3)

@@ -40,11 +40,11 @@ class SlipFusionNode(Node):
         self._decimator = Decimator(rate)
         self._motion: Motion | None = None
         self._left_out, self._coasted = 0, 0
+        self._stream = ImuStream(self, self.robot, self._on_motion)  # declares the rest
         self._twist = self.create_publisher(TwistWithCovarianceStamped, "slip/twist", SENSOR_SOURCE)
         self._odom = self.create_publisher(Odometry, "odom", SENSOR_SOURCE) if with_odom else None
         send_tf = with_odom and with_tf and TFMessage is not None
         self._tf = self.create_publisher(TFMessage, "/tf", 100) if send_tf else None
-        self._stream = ImuStream(self, self.robot, self._on_motion)
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="fusion")
 
     def _on_motion(self, stamp: Time, dt: float | None, motion: Motion) -> None:

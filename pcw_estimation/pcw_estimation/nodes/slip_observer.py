@@ -16,6 +16,7 @@ from pcw_description.nodes.node_tools import (
     Decimator,
     Silence,
     StampWatch,
+    all_declared,
     declare,
     fill_joint_state,
     joint_state_arrays,
@@ -55,6 +56,7 @@ class SlipObserverNode(Node):
         longest_gap = declare(
             self, "longest_gap", 0.1, "longest time between joint_states that is bridged", "s", (0.001, 1.0), read_only=True
         )
+        all_declared(self)
         if method == "sliding_mode":
             parameters = SlidingModeParameters(measured=measured, mass_tolerance=tolerance)
             self._observer = RobotSlidingModeObserver(self.robot, parameters)

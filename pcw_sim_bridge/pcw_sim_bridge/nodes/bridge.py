@@ -13,7 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
-from pcw_description.nodes.node_tools import COMMAND, declare, run_node, stamp_to_ns
+from pcw_description.nodes.node_tools import COMMAND, all_declared, declare, run_node, stamp_to_ns
 
 from ..plants.factory import make_plant
 from ..plants.plant import PLANT_NAMES, PlantError
@@ -66,6 +66,7 @@ class BridgeNode(Node):
         )
         declare(self, "start_paused", False, "wait for ~/pause with false, or ~/step", read_only=True)
 
+        all_declared(self)
         self.robot = robot
         self._simulated = SimulatedRobot(make_plant(plant, robot, dt, gui, lifted), seed, source, timeout, bandwidth)
         for _ in range(3):  # compiles everything before the clock starts

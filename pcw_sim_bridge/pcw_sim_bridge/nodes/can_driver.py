@@ -20,6 +20,7 @@ from pcw_description.nodes.lifecycle import RobustLifecycleNode
 from pcw_description.nodes.node_tools import (
     COMMAND,
     SENSOR_STREAM_SOURCE,
+    all_declared,
     declare,
     fill_joint_state,
     ns_to_stamp,
@@ -66,6 +67,7 @@ class CanDriverNode(RobustLifecycleNode):
         self._log_path = declare(
             self, "log", "", "write all frames to this .log, .asc or .blf; a number is added where it exists", read_only=True
         )
+        all_declared(self)
         self.robot, self._file = robot, read_can_file(name, robot)
         if port:
             self._file = on_udp(self._file, port)

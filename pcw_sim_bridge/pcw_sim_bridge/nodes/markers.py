@@ -14,7 +14,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
-from pcw_description.nodes.node_tools import SENSOR, SENSOR_SOURCE, declare, joint_state_arrays, run_node
+from pcw_description.nodes.node_tools import (
+    SENSOR,
+    SENSOR_SOURCE,
+    all_declared,
+    declare,
+    joint_state_arrays,
+    run_node,
+)
 
 from ..ground_patch import ground_patches
 from ..wheel_arrows import Arrow, force_arrows, slip_arrows
@@ -39,6 +46,7 @@ class MarkersNode(Node):
         declare(self, "slip_scale", 2.0, "length of an arrow per slip velocity", "m per m/s", (1e-3, 1e3))
         declare(self, "lifetime", 0.5, "an arrow vanishes so long after the last measurement", "s", (0.02, 60.0))
         world = declare(self, "world_frame", "map", "frame that the ground patches are in", read_only=True)
+        all_declared(self)
         self._forces: dict[int, WrenchStamped] = {}  # the newest by caster, until drawn
         self._slip: JointState | None = None
         self._drawn, self._problems = 0, Problems(self)

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
-from pcw_description.nodes.node_tools import SENSOR_SOURCE, SENSOR_STREAM, declare, run_node
+from pcw_description.nodes.node_tools import SENSOR_SOURCE, SENSOR_STREAM, all_declared, declare, run_node
 from pcw_description.ros_messages import IMU, JOINT_STATE, ODOMETRY, TWIST_STAMPED
 
 from ..mismatch.departure_keeper import RANGES as KEEP_RANGES
@@ -99,6 +99,7 @@ class MismatchMonitorNode(Node):
         what = "folder for recordings of departures; none are kept by default"
         folder = declare(self, "keep_folder", "", what, read_only=True)
         parameters = KeepParameters(folder, **self._declared(KEEP_PARAMETERS, KeepParameters(folder), KEEP_RANGES))
+        all_declared(self)
         return DepartureKeeper(parameters) if folder else None
 
     # --- Messages ---------------------------------------------------------------------------------------

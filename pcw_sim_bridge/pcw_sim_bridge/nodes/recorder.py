@@ -19,7 +19,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Status
-from pcw_description.nodes.node_tools import declare, run_node
+from pcw_description.nodes.node_tools import all_declared, declare, run_node
 from pcw_description.recording_writer import COMPRESSIONS, OfferedQos, RecordingWriter
 from pcw_description.ros_messages import message_definition
 
@@ -74,6 +74,7 @@ class RecorderNode(Node):
         )
         declare(self, "max_duration", 0.0, "stop after this long; 0 is never", "s", (0.0, 1e7))
 
+        all_declared(self)
         self.finished = False  # nothing left to do: the process may end
         self._closed = False
         self._patterns = tuple(self._absolute(name) for name in names if name)

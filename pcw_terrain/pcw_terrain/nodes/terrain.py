@@ -20,6 +20,7 @@ from pcw_description.nodes.node_tools import (
     Decimator,
     Silence,
     StampWatch,
+    all_declared,
     declare,
     fill_joint_state,
     joint_state_arrays,
@@ -64,6 +65,7 @@ class TerrainNode(Node):
         longest_gap = declare(
             self, "longest_gap", 0.1, "longest time between joint_states that is bridged", "s", (0.001, 1.0), read_only=True
         )
+        all_declared(self)
         cells = max(1, min(round(size / resolution), 4000))
         half = 0.5 * cells * resolution
         self._map = TerrainMap(MapParameters(resolution, cells, cells, (-half, -half)))
