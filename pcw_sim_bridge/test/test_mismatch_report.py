@@ -450,9 +450,22 @@ def test_page_shows_numbers_with_the_digits_they_have(demo: Path) -> None:
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_renders(tmp_path: Path, verdict: str) -> None:
     page = write_report(minimal_findings(verdict), PATCHED, tmp_path / "out").read_text(encoding="utf-8")
-    assert report.HEADLINES[verdict].partition("{}")[0] in page
+    findings = minimal_findings(verdict)
+    assert (findings.nothing_missing()[1:] if verdict == "no_mismatch" else report.HEADLINES[verdict]) in page
     assert 'id="effects"' not in page
     assert "nothing was held out" in page
+
+
+def test_numbers_that_no_healthy_robot_has_are_in_the_verdict(tmp_path: Path) -> None:
+    """A torque constant thirteen tolerances off was said to be "within noise and tolerances"."""
+    strained = dataclasses.replace(demo_findings().retuned[0], value=68.0, healthy=2.22)
+    nothing = {"verdict": "no_mismatch", "effects": (), "locations": (), "unknown": ()}
+    findings = dataclasses.replace(demo_findings(), **nothing, retuned=(strained,))
+    text = "no effect is missing, but the description is off by more than its tolerances in chassis.mass (8.1 tolerances)"
+    assert findings.summary()[1] == f"Verdict:   {text}"
+    assert text[0].upper() + text[1:] in write_report(findings, None, tmp_path / "report").read_text(encoding="utf-8")
+    healthy = dataclasses.replace(findings, retuned=(dataclasses.replace(strained, value=75.0),))
+    assert "within noise and tolerances" in healthy.summary()[1]
 
 
 def test_unknown_verdict_is_refused(tmp_path: Path) -> None:

@@ -440,6 +440,17 @@ def test_noise_in_its_columns_is_no_need_of_an_effect():
     assert chosen(linear_problem(left, effect, noisy=True)) == []
 
 
+def test_several_times_the_noise_is_an_effect_though_a_number_can_do_it():
+    """A torque constant 15 % off was said to be within tolerances: as a number, thirteen of them off, it did as well.
+
+    Here the number would be three hundred off, and the effect twice what the model misjudges.
+    """
+    time = np.arange(3000) / RATE
+    number = np.cos(0.3 * time)
+    left = 0.3 * number + 0.01 * np.random.default_rng(7).standard_normal(len(time))
+    assert chosen(linear_problem(left, {"same": (number, 100.0)}, noisy=True)) == ["same"]
+
+
 def test_what_the_model_does_wrong_in_a_wilder_motion_speaks_against_no_effect():
     """A number eight tolerances off, held against a recording of which forty times the noise is left in any case."""
     time = np.arange(3000) / RATE

@@ -33,7 +33,7 @@ from .generated_effect import NoSuchKernelError, generate
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
-from .regression_problem import FloatArray, RegressionProblem
+from .regression_problem import HEALTHY, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .subject import Subject
 from .unknown_law import Law
@@ -267,7 +267,8 @@ def _retuned(problem: RegressionProblem, fit: Fit) -> tuple[RetunedFinding, ...]
             half = 1.96 * math.hypot(float(deviation), scale)
             found.append(
                 RetunedFinding(
-                    nuisance.name, nuisance.unit, nuisance.nominal, value, value - half, value + half, nuisance.deviation
+                    nuisance.name, nuisance.unit, nuisance.nominal, value, value - half, value + half, nuisance.deviation,
+                    nuisance.healthy,
                 )
             )
     return tuple(found)
@@ -344,9 +345,9 @@ def _notes(
         if named.term.recording is not None:
             notes.append(f"{named.term.effect} was at work in one recording alone: {recordings[named.term.recording]}.")
     for number in retuned:
-        if abs(number.value - number.nominal) > 3.0 * number.tolerance:
-            times = abs(number.value - number.nominal) / number.tolerance
-            notes.append(f"{number.name} comes out {times:.1f} tolerances from the description: check it or its tolerance.")
+        if number.times > HEALTHY:
+            far = f"{number.times:.1f} tolerances from the description"
+            notes.append(f"{number.name} comes out {far}: check it or its tolerance.")
     if not has_holdout:
         notes.append(
             "No hold-out recording was given: the proof leaves out manoeuvres of the fitted ones, which the choice of the "

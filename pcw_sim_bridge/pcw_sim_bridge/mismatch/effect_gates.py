@@ -78,7 +78,9 @@ class EffectGates:
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
             needed = retunings[index] / self.settings.smallest_threshold
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
-                needed = min(needed, float(np.max(sizes / np.maximum(self._least(instance) * remains, 1e-300))))
+                beside = sizes / np.maximum(self._least(instance) * remains, 1e-300)
+                alone = own[index] / np.maximum(np.maximum(NOISY_FACTOR * remains, self._details([instance])), 1e-300)
+                needed = min(needed, float(np.max(np.maximum(beside, alone))))
             share = max(share, needed)
             shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
         return losses, held_out, shares

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -132,7 +133,11 @@ class UnknownFinding:
 
 @dataclasses.dataclass(frozen=True)
 class RetunedFinding:
-    """A number of the description that the recording moves, within its tolerance or (then a warning) beyond it."""
+    """A number of the description that the recording moves, within its tolerance or (then a warning) beyond it.
+
+    Attributes:
+        healthy: change up to which it is that of a healthy system, in `unit`; infinite where a healthy one may be far off.
+    """
 
     name: str
     unit: str
@@ -141,6 +146,17 @@ class RetunedFinding:
     low: float
     high: float
     tolerance: float
+    healthy: float = math.inf
+
+    @property
+    def times(self) -> float:
+        """How many tolerances it comes out from the description."""
+        return abs(self.value - self.nominal) / self.tolerance
+
+    @property
+    def strained(self) -> bool:
+        """Whether no healthy system has it."""
+        return abs(self.value - self.nominal) > self.healthy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -363,11 +379,15 @@ class Findings:
         """Whether anything is modelled that the description leaves out."""
         return bool(self.effects) or any(leftover.helps for leftover in self.unknown)
 
-    def limits(self) -> str:
-        """What a verdict does not cover, as words after "nothing is missing"; "" where forces were judged."""
-        if any("force" in channel.name for channel in self.channels):
-            return ""
-        return f" in {', '.join(channel.name for channel in self.channels)} (forces could not be judged)"
+    def nothing_missing(self) -> str:
+        """What "no_mismatch" says and does not say, as one sentence without its full stop."""
+        where = ""
+        if not any("force" in channel.name for channel in self.channels):
+            where = f" in {', '.join(channel.name for channel in self.channels)} (forces could not be judged)"
+        strained = [f"{number.name} ({number.times:.1f} tolerances)" for number in self.retuned if number.strained]
+        if not strained:
+            return f"nothing is missing{where}: what differs is within noise and tolerances"
+        return f"no effect is missing{where}, but the description is off by more than its tolerances in {', '.join(strained)}"
 
     def _doubt(self, effect: EffectFinding) -> str:
         """What else a named effect may be, as words after its statement."""
@@ -378,7 +398,7 @@ class Findings:
     def summary(self) -> list[str]:
         """Return five plain lines: subject, verdict, effects, held-out fit, warnings."""
         verdict = {
-            "no_mismatch": f"nothing is missing{self.limits()}: what differs is within noise and tolerances",
+            "no_mismatch": self.nothing_missing(),
             "explained": "explained: the effects below account for the mismatch",
             "partly_explained": "partly explained: the effects below, and a leftover that is not in the library",
             "unexplained": "not explained by any effect of the library",

@@ -39,7 +39,7 @@ PERSONS = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
 SHORT_LIST = 12  # rows of the ladder that are shown unfolded
 
 HEADLINES = {
-    "no_mismatch": "Nothing is missing{}. Whatever differs is within the noise and the tolerances of the description.",
+    "no_mismatch": "{nothing}.",
     "explained": "Explained. The following, added to the description, accounts for what was recorded.",
     "partly_explained": "Partly explained. Beside what can be named there is a leftover from outside the library of effects.",
     "unexplained": "Not explained. Recording and model part, and no effect of the library accounts for it.",
@@ -360,9 +360,10 @@ def report_html(
         unit=pretty_unit, seconds=seconds, nats=nats, data_uri=_data_uri,
     )
     physics = None if patched is None else patched.get("physics")
+    nothing = findings.nothing_missing()
     return environment.get_template(TEMPLATE).render(
         findings=findings,
-        headline=HEADLINES[findings.verdict].format(findings.limits()),
+        headline=HEADLINES[findings.verdict].format(nothing=nothing[0].upper() + nothing[1:]),
         badge=BADGES[findings.verdict],
         effects=[
             (effect, [(name, *_with_interval(p), p.unit) for name, p in effect.parameters.items()])
