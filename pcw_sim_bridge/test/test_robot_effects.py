@@ -3,13 +3,19 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
+from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.analysis import analyse
+from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot_effects import _flank
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
@@ -66,3 +72,22 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
     assert effect.name == "ground_slope"
     assert effect.parameters["angle"].value == pytest.approx(0.04, rel=0.05)
     assert effect.parameters["direction"].value == pytest.approx(-2.0, abs=0.1)  # not 4.28, which is the same
+
+
+def test_play_lies_where_it_lay_while_next_to_no_torque_passes():
+    """A wheel that rolls freely moves no gear: between its flanks by the torque's noise, play passed for a soft gear."""
+    torque = np.array([0.0, 0.05, 1.0, 0.02, -0.03, 0.04, -1.0, 0.02, -0.01, 1.0])
+    assert _flank(torque) == pytest.approx([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+
+
+def test_no_gear_is_softer_than_its_joint_bears():
+    """The softest gear fitted where there was play: one radian per 9.7 N m, with certainty."""
+    robot = load_robot("dyros_pcv")
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "identification", 12.0, 3), ())
+    problem = RobotProblemBuilder(robot, [recording]).build()
+    for axis, largest in zip(AXIS_NAMES, robot.torque_limit[0], strict=True):
+        gears = [t for t in problem.terms if t.effect == "gear_elasticity" and t.axis == axis]
+        assert gears
+        for term in gears:
+            [stiffness] = [p for p in term.parameters if p.name == "stiffness"]
+            assert stiffness.value(stiffness.upper) == pytest.approx(largest / LARGEST_TWIST)

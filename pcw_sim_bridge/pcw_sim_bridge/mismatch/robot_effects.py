@@ -67,8 +67,8 @@ from .rolling_model import (
 from .signal_filter import SignalFilter, derivative
 
 Sides = tuple[FloatArray, FloatArray]
-# A gear's play changes sides as its torque passes zero, over this part of the torque's size: below it is noise.
-PLAY_TORQUE = 0.02
+# A gear's play changes sides once its torque is this part of its size the other way: below it are noise and free rolling.
+PLAY_TORQUE = 0.1
 
 
 def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
@@ -150,11 +150,21 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
     torque = shaft[:, axis] - rotor * (motion.acceleration[:, i] @ coupling[axis])
     ahead = torque / gear.stiffness
     if gear.play > 0.0:
-        size = max(PLAY_TORQUE * float(np.sqrt(np.mean(torque**2))), 1e-9)
-        ahead = ahead + 0.5 * gear.play * np.clip(torque / size, -1.0, 1.0)
+        ahead = ahead + 0.5 * gear.play * _flank(torque)
     smooth = SignalFilter(motion.rate, motion.cutoff).smooth(ahead)
     moved: FloatArray = smooth[:, None] * np.linalg.inv(coupling)[:, axis]
     return moved
+
+
+def _flank(torque: FloatArray) -> FloatArray:
+    """Which flank of its play a gear lies on under a torque (T,): 1, -1, and 0 before the first clear torque.
+
+    Where next to no torque passes through it nothing moves motor and joint against each other: it stays where it lay.
+    """
+    clear = np.abs(torque) > PLAY_TORQUE * float(np.sqrt(np.mean(torque**2)))
+    last = np.maximum.accumulate(np.where(clear, np.arange(len(torque)), -1))
+    flank: FloatArray = np.where(last >= 0, np.sign(torque[last]), 0.0)
+    return flank
 
 
 def true_motion(robot: RobotDescription, motion: RobotMotion) -> RobotMotion:

@@ -37,6 +37,7 @@ from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
 HALF_A_TURN = math.pi  # [rad]
+LARGEST_TWIST = 0.2  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
@@ -202,7 +203,7 @@ class _TermMaker:
         seen = np.abs(everything).max(axis=(0, 1)) > 0.0
         if not seen.any():
             return None
-        shown = [p for p, visible in zip(searched, seen, strict=True) if visible]
+        shown = [self._sensible(p, effect, target, axis) for p, visible in zip(searched, seen, strict=True) if visible]
         names = [p.name for p in shown]
         remembered = _once_more(shapes[0], everything[:, :, seen], lambda shape: columns(shape, names))
         turning = next((p.name for p in effect.parameters if p.name in chosen.resolution and p.is_direction), None)
@@ -229,6 +230,20 @@ class _TermMaker:
             once=look in ("windows", "patches"),
             recording=recording,
         )
+
+    def _sensible(
+        self, parameter: EffectParameter, effect: Effect, target: Sequence[str], axis: str | None
+    ) -> EffectParameter:
+        """The parameter with the bounds that it has on this robot.
+
+        A gear that twists and one that plays are alike where torques are small, and the softest of all fits most noise.
+        """
+        if not isinstance(effect, TransmissionEffect) or not parameter.reciprocal:
+            return parameter
+        column = AXIS_NAMES.index(axis or effect.axis)
+        largest = max(float(self.robot.torque_limit[self.robot.caster_index(name), column]) for name in target)
+        softest = largest / LARGEST_TWIST
+        return dataclasses.replace(parameter, lower=float(np.clip(softest, parameter.lower, parameter.typical)))
 
     def _searched(self, effect: Effect) -> tuple[EffectParameter, ...]:
         """The parameters of an effect that are searched for; of clocks that of the tracker where no IMU has one."""
