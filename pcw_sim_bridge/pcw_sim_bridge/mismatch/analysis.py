@@ -15,7 +15,6 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects, also_known, get
 
 from .command_findings import command_findings
-from .evidence_selection import LadderStep
 from .explanation import Explanation, NamedTerm, explain, explanation_by
 from .findings import (
     ChannelFinding,
@@ -35,6 +34,7 @@ from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
 from .regression_problem import HEALTHY, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
+from .set_growth import LadderStep
 from .subject import Subject
 from .unknown_law import Law
 from .whitened_regression import Fit, predicted

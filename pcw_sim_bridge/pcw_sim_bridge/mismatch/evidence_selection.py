@@ -14,63 +14,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from .effect_gates import EffectGates
-from .gathered_terms import gatherings
-from .noise_model import (
-    SLOW_ORDINATES,
-    channel_deviations,
-    fit_noise_model,
-    huber_weights,
-    reliability,
-    white_noise_model,
-)
-from .regression_problem import (
-    FloatArray,
-    IntArray,
-    RegressionProblem,
-    SizedTerm,
-    contiguous_blocks,
-    segment_slices,
-)
+from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
+from .noise_model import SLOW_ORDINATES
+from .regression_problem import FloatArray, RegressionProblem, segment_slices
 from .selection_settings import SelectionSettings
+from .set_growth import LadderStep, Progress, SetGrowth
 from .shape_search import refined_shape
-from .whitened_regression import Candidate, Fit, Instance, WhitenedRegression
+from .whitened_regression import Fit, Instance, WhitenedRegression
 
-Progress = Callable[[str], None]
-# So many times the problem is made exact where its fit came out, or this part of the way there.
-EXACT_ROUNDS = 6
-STEPS = (1.0, 0.5, 0.2)
-RESHAPINGS = 3  # the first under the noise that a wrong shape leaves, which makes shapes alike
-GROWTH = 1.01  # by which the error of a step may be more, numbers of a first order having been put right
-SPLIT_AMONG = 12  # candidates that a term may have taken in
-GATHERED_AMONG = 2  # candidates that several terms may be parts of
-# After so many rounds that did not settle columns are taken anew; where they have been before, after twice as many.
-DERIVED_AFTER = 2
 # Effects of so little less evidence [nats] are alike, and at most so many are tried; those of so much less are not looked at.
 ALIKE, MOST_ALIKE, FAR = 10.0, 3, 30.0
 # What stands in for an effect that a gate stops must be worth so much [nats]: of little, much is alike.
 LEAST_STAND_IN = 30.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
-# A fit that moves less than this part of its intervals' deviations has arrived.
-STEADY = 0.2
-STEADY_EVIDENCE = 1.0  # nats; what a set is worth where it is exact is not asked for more exactly
-# So many times the noise is estimated again, until no channel's falls by more than this.
-SETTLING_ROUNDS, SETTLED = 8, 0.9
-
-
-@dataclasses.dataclass(frozen=True)
-class LadderStep:
-    """One line of the report's ladder: what was tried, what it gained, what became of it."""
-
-    description: str
-    gain: float
-    held_out_gain: float | None
-    outcome: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +54,7 @@ class Selection:
     ladder: tuple[LadderStep, ...]
 
 
-class EffectSearch:
+class EffectSearch(SetGrowth):
     """The search on one problem. Holds the current noise model; everything random comes from `rng`."""
 
     def __init__(
@@ -102,14 +64,9 @@ class EffectSearch:
         settings: SelectionSettings | None = None,
         progress: Progress = lambda message: None,
     ) -> None:
-        self.problem = problem
+        """Take a problem that is exact at the description."""
+        super().__init__(problem, settings, progress)
         self.rng = rng
-        self.settings = settings or SelectionSettings()
-        self.progress = progress
-        self.block: IntArray = contiguous_blocks(problem.segment, self.settings.blocks)
-        self.ladder: list[LadderStep] = []
-        # Where the problem is exact: all numbers of the description by name, of effects by term, shape and parameter.
-        self._point: dict[object, float] | None = None
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
         self.noise_gain = (0.0, 1.0)
 
@@ -250,329 +207,6 @@ class EffectSearch:
         own, other = (self._exact_evidence(selection.regression, fit) for fit in sets)
         return own - other
 
-    def _exact_evidence(self, regression: WhitenedRegression, fit: Fit) -> float:
-        """Log evidence of a set where it is exact, and its columns with it: what is reached there, not what is promised."""
-        here, reached = (self.problem, self._point), -math.inf
-        for _ in range(EXACT_ROUNDS):
-            if not self._exact_at(fit):
-                break
-            self.problem = self.problem.derived()
-            regression = regression.moved(self.problem)
-            fit = regression.fit(fit.instances)
-            missing = self._point_of(fit) - fit.mean
-            promised = fit.log_evidence
-            there = promised - 0.5 * float(missing @ np.linalg.solve(fit.covariance, missing))
-            reached = max(reached, there)
-            if promised - there < STEADY_EVIDENCE:
-                break
-        self.problem, self._point = here
-        return reached if math.isfinite(reached) else fit.log_evidence
-
-    def _point_of(self, fit: Fit) -> FloatArray:
-        """Sizes (k,) of nuisances and effects where the problem is exact."""
-        point = self._point or {}
-        keys: list[object] = [nuisance.name for nuisance in self.problem.nuisances]
-        keys += [(instance.term, instance.shape, k) for instance in fit.instances for k in instance.active]
-        return np.array([point[key] for key in keys])
-
-    def made_exact(self, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
-        """Make the problem exact at the sizes of these effects and of the numbers beside them, and search shapes again.
-
-        What their first order leaves would pass for other effects. A step that leaves more than there was is halved.
-        """
-        reshapings = 0
-        for count in range(EXACT_ROUNDS):
-            known = self.problem.point is not None and self.problem.point.derived
-            if count == (2 * DERIVED_AFTER if known else DERIVED_AFTER):
-                self.problem = self.problem.derived()
-            residual, cost = self._left_and_cost(instances)
-            fit = self.whiten_at(residual).fit(instances)
-            allowed = GROWTH * self._error(residual, residual) + 2.0 * cost
-            before = self.problem, self._point
-            for part in STEPS:
-                if not self._exact_at(fit, part):
-                    if self.problem.point is None or self.problem.point.derived:
-                        return self._reshaped(instances, residual, False)
-                    # With the slopes of another place one arrives where those are level, and not where the error is least.
-                    self.problem, again = self.problem.derived(), instances
-                    break
-                again = instances if reshapings == RESHAPINGS else self._reshaped(instances, residual, reshapings == 0)
-                left, cost = self._left_and_cost(again)
-                if self._error(left, residual) + 2.0 * cost <= allowed:
-                    break
-                self.problem, self._point = before
-            else:
-                return instances
-            reshapings = RESHAPINGS if again == instances else reshapings + 1
-            instances = again
-        return instances
-
-    def _reshaped(self, instances: tuple[Instance, ...], residual: FloatArray, coarse: bool) -> tuple[Instance, ...]:
-        """Search the shapes again, near where they are; coarse: of what is at work once also as far as its neighbours."""
-        regression = self.whiten_at(residual)
-        for index, instance in enumerate(instances):
-            term = self.problem.terms[instance.term]
-            if not term.resolution:
-                continue
-            others = (*instances[:index], *instances[index + 1 :])
-            around = self.problem.around(instance.term, instance.shape)
-            near = regression if around is self.problem else regression.moved(around)
-            found = refined_shape(near, others, instance, coarse and term.once)
-            if found != instance:
-                self.problem, regression = around, near
-            instances = (*instances[:index], found, *instances[index + 1 :])
-        return instances
-
-    def _exact_at(self, fit: Fit, part: float = 1.0) -> bool:
-        """Make the problem exact where a fit comes out, or a part of the way there; False where it has been so already."""
-        problem, terms = self.problem, self.problem.terms
-        keys: list[object] = [nuisance.name for nuisance in problem.nuisances]
-        bounds = [nuisance.changes for nuisance in problem.nuisances]
-        for instance in fit.instances:
-            parameters = terms[instance.term].parameters
-            keys += [(instance.term, instance.shape, k) for k in instance.active]
-            bounds += [(parameters[k].lower, parameters[k].upper) for k in instance.active]
-        known = {} if self._point is None else self._point
-        wanted = np.array([float(np.clip(mean, *bound)) for mean, bound in zip(fit.mean, bounds, strict=True)])
-        start = np.array([known.get(key, value) for key, value in zip(keys, wanted, strict=True)])
-        for index, key in enumerate(keys):
-            # Its column is a secant, which leads past the size that is sought as far as the effect is curved.
-            power = problem.powers.get(key, 1.0)  # type: ignore[call-overload]
-            if power != 1.0 and wanted[index] * start[index] > 0.0:
-                wanted[index] = start[index] * (wanted[index] / start[index]) ** (1.0 / power)
-        deviation = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
-        if set(known) == set(keys) and np.all(np.abs(wanted - start) < STEADY * deviation):
-            return False
-        point = dict(zip(keys, start + part * (wanted - start), strict=True))
-        sizes = []
-        for instance in fit.instances:
-            coefficients = np.zeros(len(terms[instance.term].parameters))
-            coefficients[list(instance.active)] = [point[instance.term, instance.shape, k] for k in instance.active]
-            sizes.append(SizedTerm(instance.term, instance.shape, coefficients))
-        self._point = point
-        self.problem = problem.exact_at({n.name: point[n.name] for n in problem.nuisances}, sizes)
-        return self.problem is not problem
-
-    def _error(self, residual: FloatArray, noise: FloatArray) -> float:
-        """Sum of squares of a residual (T, C) in units of the deviations of another, outliers held down."""
-        valid, total = self.problem.valid, 0.0
-        for channel, deviation in enumerate(channel_deviations(noise, valid)):
-            values = residual[valid[:, channel], channel] / deviation
-            total += float(np.sum(huber_weights(values) * values**2))
-        return total
-
-    def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
-        """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
-        problem = self.problem
-        if white:
-            noise = white_noise_model(residual, problem.valid)
-        else:
-            noise = fit_noise_model(residual, problem.valid, problem.segment)
-        # What is large at the first look may be an event, which held down like an outlier would never be found.
-        weights = reliability(problem, residual, robust=not by_channel)
-        return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)
-
-    def residual_of(self, instances: Sequence[Instance]) -> FloatArray:
-        """Residual (T, C) of the least-squares fit of a set, with robust weights."""
-        return self._left_and_cost(instances)[0]
-
-    def _left_and_cost(self, instances: Sequence[Instance]) -> tuple[FloatArray, float]:
-        """The same with what its re-tuning costs [nats]."""
-        residual, cost = self.problem.residual, 0.0
-        for _ in range(3):
-            regression = self.whiten_at(residual, white=True)
-            fit = regression.fit(instances)
-            residual, cost = regression.unwhitened_residual(fit), regression.tolerance_cost(fit)
-        return residual, cost
-
-    # -- 1 grow -------------------------------------------------------------------------------------------------
-
-    def over_complete(self) -> tuple[Instance, ...]:
-        """A set that explains more than there is, by plain least squares: what it leaves is the first idea of the noise.
-
-        Every residual that still holds a large effect looks like strong slow noise, under which nothing could be found.
-        """
-        instances: tuple[Instance, ...] = ()
-        regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
-        settled = False
-        while len(instances) < self.settings.largest_set:
-            step = self.best_addition(regression, instances)
-            if step is None or step.gain < self.settings.lenient_gain:
-                if settled:
-                    break
-                # Only now: the shapes of a grid fit no signal that stands far above its noise.
-                self._settle(regression, instances)
-                settled = True
-                continue
-            if sum(i.term == step.instance.term for i in instances) >= self.settings.first_repeats:
-                break
-            instances = (*instances, refined_shape(regression, instances, step.instance))
-            instances = self.improve(regression, instances)
-            left = regression.unwhitened_residual(regression.fit(instances))
-            regression.rescale(channel_deviations(left, self.problem.valid))
-        return instances
-
-    def _settle(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> None:
-        """Take for noise what a set and the tolerances leave, which is less the less noise is taken for granted.
-
-        Else many numbers, each well within its tolerance, would do for one effect: little as they explain, it would be enough.
-        """
-        deviations = regression.noise.taps[:, 0] ** -1.0
-        for _ in range(SETTLING_ROUNDS):
-            before = deviations
-            deviations = channel_deviations(regression.unwhitened_residual(regression.fit(instances)), self.problem.valid)
-            regression.rescale(deviations)
-            if np.all(deviations > SETTLED * before):
-                break
-
-    def thin(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[Instance, ...]:
-        """Drop terms as long as that costs less than the lenient gain."""
-        while instances:
-            fit = regression.fit(instances)
-            losses = [
-                fit.log_evidence - regression.fit(instances[:i] + instances[i + 1 :]).log_evidence
-                for i in range(len(instances))
-            ]
-            index = int(np.argmin(losses))
-            if losses[index] >= self.settings.lenient_gain and regression.within_bounds(fit):
-                break
-            instances = instances[:index] + instances[index + 1 :]
-        return instances
-
-    def grow(
-        self, regression: WhitenedRegression, instances: tuple[Instance, ...], least_gain: float, settling: bool = False
-    ) -> tuple[Instance, ...]:
-        """Forward selection of all that gains so much, exchanging terms where that helps, unless the set is settling."""
-        while len(instances) < self.settings.largest_set:
-            step = self.best_addition(regression, instances)
-            if step is None or step.gain < least_gain:
-                break
-            instances = (*instances, refined_shape(regression, instances, step.instance))
-            self.progress(f"+ {self.label(instances[-1])}: gain {step.gain:.1f} nats")
-            self.ladder.append(LadderStep(f"add {self.label(instances[-1])}", step.gain, None, "tried"))
-            if not settling:
-                instances = self.improve(regression, instances)
-        return instances
-
-    def best_addition(
-        self, regression: WhitenedRegression, instances: Sequence[Instance]
-    ) -> Candidate | None:
-        """The candidate of largest gain with which every parameter of the joint fit stays within its bounds."""
-        best: Candidate | None = None
-        for candidate in regression.scan(instances)[0][:12]:
-            if not math.isfinite(candidate.gain) or (best is not None and candidate.gain < best.gain):
-                break
-            if self.repeats(candidate.instance, instances):
-                continue
-            if regression.within_bounds(regression.fit([*instances, candidate.instance])):
-                best = candidate
-        return best
-
-    def repeats(self, candidate: Instance, instances: Sequence[Instance]) -> bool:
-        """Whether a repeatable term is already there with practically the same shape."""
-        term = self.problem.terms[candidate.term]
-        for instance in instances:
-            if instance.term != candidate.term:
-                continue
-            if not term.repeatable:
-                return True
-            mine, theirs = dict(candidate.shape), dict(instance.shape)
-            if all(
-                abs(mine[name] - theirs[name]) < step
-                for name, (kind, step) in term.resolution.items()
-                if kind == "linear"
-            ):
-                return True
-        return False
-
-    def improve(
-        self, regression: WhitenedRegression, instances: tuple[Instance, ...]
-    ) -> tuple[Instance, ...]:
-        """Exchange a term for another one, or drop it, wherever the evidence of the whole set rises."""
-        for _ in range(2 * self.settings.largest_set):
-            fit = regression.fit(instances)
-            change = self.best_exchange(regression, instances, fit)
-            if change is None:
-                break
-            description, instances = change
-            self.progress(description)
-            self.ladder.append(
-                LadderStep(
-                    description, regression.fit(instances).log_evidence - fit.log_evidence, None, "done"
-                )
-            )
-        return instances
-
-    def best_exchange(
-        self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit
-    ) -> tuple[str, tuple[Instance, ...]] | None:
-        """The first exchange or removal that raises the evidence by more than half a nat, if any."""
-        for others, wider in gatherings(self.problem, instances):
-            for candidate in regression.scan(others, only=wider)[0][:GATHERED_AMONG]:
-                gathered = (*others, refined_shape(regression, others, candidate.instance))
-                trial = regression.fit(gathered)
-                if trial.log_evidence > fit.log_evidence + 0.5 and regression.within_bounds(trial):
-                    return f"gather into {self.label(gathered[-1])}", gathered
-        for index, instance in enumerate(instances):
-            others = instances[:index] + instances[index + 1 :]
-            without = regression.fit(others)
-            if without.log_evidence > fit.log_evidence and regression.within_bounds(without):
-                return f"drop {self.label(instance)}", others
-            for candidate in regression.scan(others)[0][:3]:
-                other_shape = candidate.instance.term != instance.term
-                if not other_shape or without.log_evidence + candidate.gain < fit.log_evidence + 0.5:
-                    continue
-                if self.repeats(candidate.instance, others):
-                    continue
-                refined = refined_shape(regression, others, candidate.instance)
-                trial = regression.fit([*others, refined])
-                if trial.log_evidence > fit.log_evidence + 0.5 and regression.within_bounds(trial):
-                    return f"exchange {self.label(instance)} for {self.label(refined)}", (*others, refined)
-            reshaped = self.best_split(regression, others, instance, fit)
-            if reshaped is not None:
-                return reshaped
-        return None
-
-    def best_split(
-        self, regression: WhitenedRegression, others: tuple[Instance, ...], instance: Instance, fit: Fit
-    ) -> tuple[str, tuple[Instance, ...]] | None:
-        """Whether an instance stands for two causes: another shape of it together with one more term.
-
-        A single step cannot find this. A wide Stribeck curve passes for Coulomb plus a narrow one, and at its width
-        adding Coulomb friction gains nothing.
-        """
-        own = self.problem.terms[instance.term]
-        if len(own.shapes) < 2 or own.once or own.turning:  # places, times and phases do not widen to take in another cause
-            return None
-        for candidate in regression.scan(others)[0][:SPLIT_AMONG]:
-            term = self.problem.terms[candidate.instance.term]
-            if (
-                candidate.instance.term == instance.term
-                or term.repeatable
-                or not math.isfinite(candidate.gain)
-            ):
-                continue
-            again = regression.scan([*others, candidate.instance], only=[instance.term])[0]
-            if not again or not math.isfinite(again[0].gain):
-                continue
-            split = (
-                *others,
-                candidate.instance,
-                refined_shape(regression, [*others, candidate.instance], again[0].instance),
-            )
-            trial = regression.fit(split)
-            if (
-                trial.log_evidence > fit.log_evidence + self.settings.lenient_gain
-                and regression.within_bounds(trial)
-            ):
-                return (
-                    f"split {self.label(instance)} into {self.label(split[-2])} and {self.label(split[-1])}",
-                    split,
-                )
-        return None
-
-    # -- 2 calibrate --------------------------------------------------------------------------------------------
-
     def surrogates(self, regression: WhitenedRegression, fit: Fit) -> FloatArray:
         """Whitened targets of pure noise (R, N): the residual with its spectrum kept and its phases drawn at random.
 
@@ -607,8 +241,6 @@ class EffectSearch:
             f"surrogates: largest gain of noise {np.median(largest):.1f} (median), threshold {tail:.1f} nats"
         )
         return max(self.settings.smallest_threshold, tail)
-
-    # -- 3 prune ------------------------------------------------------------------------------------------------
 
     def prune(
         self, regression: WhitenedRegression, instances: tuple[Instance, ...], threshold: float
@@ -710,12 +342,6 @@ class EffectSearch:
             for index, instance in enumerate(chosen)
         ]
         return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), (*self.ladder, *named))
-
-    def label(self, instance: Instance) -> str:
-        """Effect, target and shape in one short text."""
-        term = self.problem.terms[instance.term]
-        shape = ", ".join(f"{name} {value:.4g}" for name, value in instance.shape if name in term.resolution)
-        return f"{term.key} ({shape})" if shape else term.key
 
 
 def _terms(instances: Sequence[Instance]) -> tuple[int, ...]:

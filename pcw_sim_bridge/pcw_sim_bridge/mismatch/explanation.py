@@ -27,10 +27,11 @@ from scipy import stats
 from pcw_description.effects.registry import get
 
 from .effect_gates import EffectGates
-from .evidence_selection import EffectSearch, Progress, Selection
+from .evidence_selection import EffectSearch, Selection
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
 from .regression_problem import HEALTHY, FloatArray, RegressionProblem, Term
 from .selection_settings import SelectionSettings
+from .set_growth import Progress
 from .shape_search import refined_shape, shape_interval
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
