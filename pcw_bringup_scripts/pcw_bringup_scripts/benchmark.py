@@ -31,6 +31,7 @@ from pcw_description.augmented_object_model import AugmentedObjectModel
 from pcw_description.differential_kinematics import inverse_kinematics
 from pcw_description.effects.registry import all_effects, read_physics
 from pcw_description.errors import PcwError
+from pcw_description.new_file import require_new_file
 from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
@@ -430,17 +431,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="benchmark", description="Measure how fast this machine runs the PCW packages.")
     parser.add_argument("--robot", default="thesis", help="shipped robot or path of a robot file (default: %(default)s)")
     parser.add_argument("--repeats", type=int, default=15, help="how often each figure is measured (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE, a new one, as well")
     options = parser.parse_args(arguments)
     if options.repeats < 1:
         parser.error(f"argument --repeats: {options.repeats} is not allowed; allowed: at least 1")
     try:
         robot = load_robot(options.robot)
         robot.require_torque_control()
+        if options.json is not None:
+            require_new_file(options.json, "argument --json")
     except PcwError as error:
         parser.error(str(error))
-    if options.json and not options.json.parent.is_dir():
-        parser.error(f"argument --json: {options.json.parent} is not a folder")
     facts = machine()
     print(f"robot {robot.name}; " + "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items()))
     print(f"\n{'':<45}{'best':>9}{'median':>9}  {'':<12}{'target':>8}", flush=True)

@@ -348,6 +348,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except PcwError as error:
         print(f"demo_run: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # no folder can be made there, or the disk is full
+        print(f"demo_run: --out {arguments.out}: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

@@ -68,7 +68,8 @@ def test_what_cannot_run_says_why():
         (["--robot", "thesiss"], "did you mean 'thesis'"),
         (["--robot", "mpo700"], "torque control needs at least 0.001 m"),
         (["--repeats", "0"], "--repeats: 0 is not allowed; allowed: at least 1"),
-        (["--json", "no/such/folder/figures.json"], "no/such/folder is not a folder"),
+        (["--json", "no/such/folder/figures.json"], "no/such/folder; allowed: a file in a folder that exists"),
+        (["--json", "."], "--json .: exists already and is left as it is; allowed: a new file"),
     ],
 )
 def test_bad_input_ends_with_status_2_and_one_line(arguments, message, capsys):

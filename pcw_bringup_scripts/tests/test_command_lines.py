@@ -58,3 +58,11 @@ def test_an_argument_that_is_none_is_refused(tmp_path, package, name):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f"{name}: ") and "'--not_an_option'" in done.stderr and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_demonstration_that_cannot_make_its_folder_says_so(tmp_path):
+    (tmp_path / "file").write_text("precious", encoding="utf-8")
+    done = run(tmp_path, "pcw_bringup_scripts", "demo_run", "--out", "file/demo", "--plant", "reduced")
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "demo_run: --out file/demo: " in done.stderr and "Not a directory" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

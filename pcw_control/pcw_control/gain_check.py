@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pcw_description.errors import PcwError
+from pcw_description.new_file import require_new_file
 from pcw_description.robot_description import RobotDescription
 from pcw_description.robot_file import load_robot, shipped_robots
 
@@ -97,16 +98,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.velocity_gain is not None:
             ComputedTorqueParameters(velocity_gain=options.velocity_gain)
         names, all_bear = options.robots or [name for name in shipped_robots() if _torque_controlled(name)], True
-        for name in names:
-            robot = load_robot(name)
+        robots = [load_robot(name) for name in names]
+        if options.write is not None:
+            options.write.mkdir(parents=True, exist_ok=True)
+            for robot in robots:
+                require_new_file(options.write / f"{robot.name}.yaml", "--write")
+        for robot in robots:
             lines, bears = report(robot, options.velocity_gain, options.delay)
             all_bear = all_bear and bears
             print("\n".join(lines))
             if options.write is not None:
-                options.write.mkdir(parents=True, exist_ok=True)
                 (options.write / f"{robot.name}.yaml").write_text(parameter_file(robot, options.delay), encoding="utf-8")
-    except (PcwError, OSError) as error:
+    except PcwError as error:
         print(f"gain_check: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"gain_check: --write {options.write}: {error.strerror or error}; allowed: a folder", file=sys.stderr)
         return 2
     return 0 if all_bear else 1
 

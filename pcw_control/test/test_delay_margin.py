@@ -78,6 +78,11 @@ def test_the_command_says_what_is_left_and_its_exit_code_what_is_borne(capsys, t
     said = capsys.readouterr().out
     assert "bears 2 ms" in said and "least margin 3.87 ms" in said
     assert (tmp_path / "thesis.yaml").exists()
+    assert gain_check.main(["thesis", "--write", str(tmp_path)]) == 2
+    assert "thesis.yaml: exists already and is left as it is" in capsys.readouterr().err
+    assert "--delay 0.002" in (tmp_path / "thesis.yaml").read_text(encoding="utf-8")
+    assert gain_check.main(["thesis", "--write", str(tmp_path / "thesis.yaml")]) == 2
+    assert "thesis.yaml: File exists; allowed: a folder" in capsys.readouterr().err
     assert gain_check.main(["thesis", "--velocity-gain", "150"]) == 1
     assert "does not bear" in capsys.readouterr().out
     assert gain_check.main([]) == 0  # what is derived is borne, by every shipped robot

@@ -238,10 +238,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         counts, warnings = import_columns(options.file, load_column_mapping(options.mapping), options.out)
     except PcwError as error:
-        print(error, file=sys.stderr)
+        print(f"import_columns: {error}", file=sys.stderr)
         return 2
     for warning in warnings:
-        print(f"{options.file}: {warning}", file=sys.stderr)
+        print(f"import_columns: {options.file}: {warning}", file=sys.stderr)
     print(f"{options.out}: " + ", ".join(f"{count} {topic.lstrip('/')}" for topic, count in sorted(counts.items())))
     return 0
 

@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .errors import DescriptionError, PcwError
+from .new_file import require_new_file
 from .robot_description import Caster, RobotDescription, thinnest_module_inertia
 from .robot_file import load_robot
 
@@ -199,9 +200,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print or write the URDF of a robot; exit 0, or 2 for bad input."""
     parser = argparse.ArgumentParser(prog="urdf", description="Print the URDF of a robot description.")
     parser.add_argument("robot", help="a robot description (.yaml), or the name of a shipped robot")
-    parser.add_argument("--out", type=Path, help="write to this file instead")
+    parser.add_argument("--out", type=Path, help="write to this new file instead")
     options = parser.parse_args(arguments)
     try:
+        if options.out is not None:
+            require_new_file(options.out, "--out")
         text = robot_urdf(load_robot(options.robot))
     except PcwError as error:
         print(f"urdf: {error}", file=sys.stderr)

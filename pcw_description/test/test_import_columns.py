@@ -150,8 +150,8 @@ def test_the_command_tells_what_it_left_out_and_replaces_nothing(tmp_path: Path,
     printed = capsys.readouterr()
     assert printed.out == f"{out}: 19 ground_truth/odom, 38 joint_states\n"
     assert printed.err.splitlines() == [
-        f"{log}: 3 cells are no numbers and are taken for absent",
-        f"{log}: 1 of 40 rows have no stamp and are left out",
+        f"import_columns: {log}: 3 cells are no numbers and are taken for absent",
+        f"import_columns: {log}: 1 of 40 rows have no stamp and are left out",
     ]
     before = sorted(path.stat().st_mtime_ns for path in out.iterdir())
     assert main(call) == 2

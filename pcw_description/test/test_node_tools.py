@@ -182,7 +182,9 @@ PROGRAM = """
 import gc
 import inspect
 import sys
+import time
 from pcw_description.errors import PcwError
+from pcw_description.nodes import node_tools
 from pcw_description.nodes.node_tools import all_declared, declare, run_node
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -190,9 +192,11 @@ from std_msgs.msg import String
 class Probe(Node):
     def __init__(self):
         super().__init__("probe")
-        kind = declare(self, "kind", "runs", "what to do", choices=("runs", "ends", "breaks", "bad input"))
+        kind = declare(self, "kind", "runs", "what to do", choices=("runs", "slow", "ends", "breaks", "bad input"))
         declare(self, "speed", 1.0, "how fast", "m/s", (0.0, 2.0), read_only=True)
         all_declared(self)
+        if kind == "slow":
+            time.sleep(1.0)
         print("made", flush=True)
         self.finished = False
         self.words = self.create_publisher(String, "words", 10)
@@ -203,7 +207,7 @@ class Probe(Node):
     def work(self, kind):
         if kind == "breaks":
             raise RuntimeError("broken on purpose")
-        if kind == "ends":
+        if kind in ("ends", "slow"):
             self.finished = True
             print(gc.get_freeze_count(), len(gc.get_objects()), len(inspect.modulesbyfile), len(sys.modules))
         print("working", flush=True)
@@ -212,6 +216,7 @@ class Probe(Node):
         self.words.publish(String(data="last words"))
         print("closed", flush=True)
 
+node_tools.PATIENCE = 0.1 if "kind:=slow" in sys.argv else 1e3  # [s]
 sys.exit(run_node(Probe))
 """
 
@@ -259,6 +264,14 @@ def test_exit_codes(kind: str, code: int, said: str, closed: bool) -> None:
     assert output.endswith("closed\n") == closed
 
 
+def test_a_node_says_that_it_runs_and_that_setting_up_takes_long() -> None:
+    """The first start compiles for a minute, without a word, and a first Ctrl-C seemed to do nothing."""
+    _, errors = start_probe("-p", "kind:=slow").communicate(timeout=DEADLINE)
+    first, running = errors.splitlines()
+    assert "still setting up: inner loops are compiled" in first and "a second Ctrl-C ends it at once" in first
+    assert running.endswith("[probe]: running")
+
+
 def test_nothing_that_can_be_done_before_is_done_in_the_middle_of_a_period() -> None:
     """What a node needs all its life is left out of garbage collections, and a first warning need not search all modules."""
     output, errors = start_probe("-p", "kind:=ends").communicate(timeout=DEADLINE)
@@ -277,7 +290,7 @@ def test_help_names_every_parameter_and_makes_no_node(argument: str) -> None:
     assert (process.returncode, errors) == (0, "")
     assert "made" not in output
     assert "--ros-args -p NAME:=VALUE" in output
-    assert "  kind   string  default runs; one of runs, ends, breaks, bad input\n                 what to do\n" in output
+    assert "  kind   string  default runs; one of runs, slow, ends, breaks, bad input\n                 what to do\n" in output
     assert "  speed  double  default 1.0 m/s; 0 to 2; fixed\n                 how fast\n" in output
 
 

@@ -187,4 +187,8 @@ def test_command_says_what_is_wrong_in_one_line(tmp_path: Path, capsys: pytest.C
     assert "did you mean 'thesis'?" in complaint and complaint.count("\n") == 1
     assert main(["thesis", "--out", str(tmp_path / "no" / "folder.urdf")]) == 2
     complaint = capsys.readouterr().err
-    assert "No such file or directory" in complaint and complaint.count("\n") == 1
+    assert "there is no folder" in complaint and complaint.count("\n") == 1
+    (tmp_path / "precious.urdf").write_text("precious", encoding="utf-8")
+    assert main(["thesis", "--out", str(tmp_path / "precious.urdf")]) == 2
+    assert "exists already and is left as it is; allowed: a new file" in capsys.readouterr().err
+    assert (tmp_path / "precious.urdf").read_text(encoding="utf-8") == "precious"

@@ -24,6 +24,7 @@ import numpy as np
 from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import rigid_motion_kernel
 from pcw_description.errors import PcwError
+from pcw_description.new_file import require_new_file
 from pcw_description.recording import Recording
 from pcw_description.robot_description import FloatArray, RobotDescription
 from pcw_description.robot_file import load_robot
@@ -220,14 +221,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("recording", help="rosbag2 folder, .mcap or .db3 with joint_states")
     parser.add_argument("--robot", required=True, help="shipped robot or path of a robot file")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="YAML file to write, for `noise`")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="YAML file to make, for `noise`")
     parser.add_argument("--confirm-time", type=float, default=0.010, help="of the detector [s] (default: %(default)s)")
     options = parser.parse_args(arguments)
     try:
         if not 0.0 <= options.confirm_time <= 10.0:
             raise EstimationError(f"confirm_time = {options.confirm_time!r} s is not allowed; allowed: 0 to 10")
-        if not options.out.resolve().parent.is_dir():
-            raise EstimationError(f"out = {str(options.out)!r} is not allowed; allowed: a file in a folder that exists")
+        require_new_file(options.out, "--out")
         robot = load_robot(options.robot)
         recording = Recording.open(options.recording, robot)
         joints = recording.joint_states

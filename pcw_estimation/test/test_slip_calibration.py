@@ -95,11 +95,16 @@ def test_the_command_reads_a_recording_and_writes_what_the_node_takes(tmp_path, 
     noise = load_slip_noise(out, THESIS)
     assert 0.0 < noise.rolling_fraction < 0.02 and "healthy" in yaml.safe_load(out.read_text())["provenance"]
     assert "rolling_fraction" in capsys.readouterr().out
+    learned = out.read_text(encoding="utf-8")
+    assert slip_calibration.main(arguments) == 2
+    assert "exists already and is left as it is" in capsys.readouterr().err and out.read_text(encoding="utf-8") == learned
+    out = tmp_path / "other.yaml"
+    arguments[-1] = str(out)
     for bad, said in (
         (["/no/such", "--robot", "thesis", "--out", str(out)], "/no/such"),
         ([arguments[0], "--robot", "thesiss", "--out", str(out)], "thesiss"),
         ([arguments[0], "--robot", "tidybot2", "--out", str(out)], "_length = .*does not match"),
-        ([arguments[0], "--robot", "thesis", "--out", "/no/such/folder/noise.yaml"], "out = '/no/such/folder/noise.yaml'"),
+        ([arguments[0], "--robot", "thesis", "--out", "/no/such/folder/noise.yaml"], "no folder /no/such/folder;"),
         ([*arguments, "--confirm-time", "-1"], "confirm_time = -1.0 s is not allowed; allowed: 0 to 10"),
     ):
         assert slip_calibration.main(bad) == 2

@@ -150,9 +150,11 @@ def test_it_learns_saves_learns_again_and_only_listens(sent: list[RawMessage], t
     [
         ("calibration:=/no/such.json", "/no/such.json cannot be read"),
         ("robot:=/no/such.yaml", "/no/such.yaml"),
-        ("learning:=1.0", "out of range"),
+        ("learning:=1.0", "learning: 1.0 is outside 5.0 .. 600.0 s"),
         ("error:=2.0", "error = 2"),
-        ("pre_roll:=.nan", "out of range"),
+        ("pre_roll:=.nan", "pre_roll: nan is not a finite number"),
+        (f"keep_folder:={__file__}", "is no folder"),
+        ("save_calibration:=/no/such/folder/file.json", "there is no folder /no/such/folder"),
     ],
 )
 def test_bad_input_ends_it_with_one_line(parameter: str, reason: str) -> None:

@@ -24,6 +24,7 @@ import dataclasses
 import inspect
 import math
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -58,6 +59,7 @@ except ImportError:  # older Jazzy patch releases do not have it
 NANOSECONDS = 1_000_000_000
 # A signal that arrives while the executor sleeps is seen when it wakes, so this is the latency of a shutdown.
 SPIN_TIMEOUT = 0.1  # [s]
+PATIENCE = 5.0  # after so long of setting up the node says what it is doing [s]
 LAST_WORDS = 1.0  # the longest that a node which ends waits for its listeners to hear them [s]
 
 
@@ -89,11 +91,14 @@ def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | Non
     exit_code = 0
     with stop_requests() as stops:
         try:
-            for factory in factories:
-                nodes.append(factory())
-                if not hasattr(nodes[-1], _ALL_DECLARED_ATTRIBUTE):
-                    raise TypeError(f"{type(nodes[-1]).__name__} does not say all_declared(self) after its parameters")
+            with _told_if_slow():
+                for factory in factories:
+                    nodes.append(factory())
+                    if not hasattr(nodes[-1], _ALL_DECLARED_ATTRIBUTE):
+                        raise TypeError(f"{type(nodes[-1]).__name__} does not say all_declared(self) after its parameters")
             _warn_of_unknown_overrides(nodes)
+            others = f": {', '.join(node.get_name() for node in nodes)}" if len(nodes) > 1 else ""
+            nodes[0].get_logger().info(f"running{others}")
             _spin(nodes, stops)
         except (KeyboardInterrupt, ExternalShutdownException):
             pass
@@ -131,6 +136,19 @@ def _answer_without_nodes(factories: Sequence[Callable[[], Node]], arguments: Se
         print(f"{_program_name()}: arguments after --ros-args: {said}; see --help", file=sys.stderr)
         return 2
     return None
+
+
+@contextmanager
+def _told_if_slow() -> Iterator[None]:
+    """Say on stderr that it takes long to set up, as it does when inner loops are compiled: who waits may think it hangs."""
+    said = f"{_program_name()}: still setting up: inner loops are compiled the first time, for a minute or two"
+    timer = threading.Timer(PATIENCE, lambda: print(f"{said}; a second Ctrl-C ends it at once", file=sys.stderr, flush=True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _outside_ros_args(arguments: Sequence[str]) -> list[str]:
@@ -332,7 +350,7 @@ def _combined_check(
             if isinstance(entry, float) and not math.isfinite(entry):
                 return f"{entry} is not a finite number"
             if range is not None and not range[0] <= entry <= range[1]:
-                return f"{entry} is outside {range[0]} .. {range[1]}{' ' if unit else ''}{unit}"
+                return f"{entry} is outside {range[0]} .. {range[1]}{f' {unit}' if unit not in ('', '1') else ''}"
             if choices is not None and entry not in choices:
                 return f"{entry!r} is not known; {nearest_name(str(entry), map(str, choices))}"
         return check(value) if check is not None else None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import TwistStamped
@@ -100,6 +101,11 @@ class MismatchMonitorNode(Node):
         folder = declare(self, "keep_folder", "", what, read_only=True)
         parameters = KeepParameters(folder, **self._declared(KEEP_PARAMETERS, KeepParameters(folder), KEEP_RANGES))
         all_declared(self)
+        # Told now, and not when something departs after hours, or when learning ends.
+        if folder and Path(folder).exists() and not Path(folder).is_dir():
+            raise PcwError(f"keep_folder {folder} is no folder; allowed: a folder, or a new one")
+        if self._save_to and not Path(self._save_to).resolve().parent.is_dir():
+            raise PcwError(f"save_calibration {self._save_to}: there is no folder {Path(self._save_to).resolve().parent}")
         return DepartureKeeper(parameters) if folder else None
 
     # --- Messages ---------------------------------------------------------------------------------------
