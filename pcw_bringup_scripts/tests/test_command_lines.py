@@ -66,3 +66,9 @@ def test_a_demonstration_that_cannot_make_its_folder_says_so(tmp_path):
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "demo_run: --out file/demo: " in done.stderr and "Not a directory" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_list_of_buses_is_not_drowned_in_what_python_can_lacks_for_others(tmp_path):
+    done = run(tmp_path, "pcw_sim_bridge", "can_doctor", "--list")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout

@@ -108,7 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             all_bear = all_bear and bears
             print("\n".join(lines))
             if options.write is not None:
-                (options.write / f"{robot.name}.yaml").write_text(parameter_file(robot, options.delay), encoding="utf-8")
+                path = options.write / f"{robot.name}.yaml"
+                path.write_text(parameter_file(robot, options.delay), encoding="utf-8")
+                print(f"  gains for {1e3 * options.delay:g} ms written to {path}")
     except PcwError as error:
         print(f"gain_check: {error}", file=sys.stderr)
         return 2

@@ -77,7 +77,7 @@ def test_the_command_says_what_is_left_and_its_exit_code_what_is_borne(capsys, t
     assert gain_check.main(["thesis", "--delay", "0.002", "--write", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "bears 2 ms" in said and "least margin 3.87 ms" in said
-    assert (tmp_path / "thesis.yaml").exists()
+    assert f"gains for 2 ms written to {tmp_path / 'thesis.yaml'}" in said and (tmp_path / "thesis.yaml").exists()
     assert gain_check.main(["thesis", "--write", str(tmp_path)]) == 2
     assert "thesis.yaml: exists already and is left as it is" in capsys.readouterr().err
     assert "--delay 0.002" in (tmp_path / "thesis.yaml").read_text(encoding="utf-8")

@@ -229,7 +229,11 @@ def test_autostart_waits_for_drives_that_are_switched_on_later(ros, tmp_path):
 
 @pytest.mark.parametrize(
     ("parameters", "complaint"),
-    [(("can_file:=/no/such.yaml",), "no/such.yaml"), (("udp_port:=-1",), "udp_port")],
+    [
+        (("can_file:=/no/such.yaml",), "no/such.yaml"),
+        (("udp_port:=-1",), "udp_port"),
+        (("log:=frames.txt",), "'.txt' is not allowed"),
+    ],
 )
 def test_bad_input_ends_it_with_one_line(ros, parameters, complaint):
     driver = ros.start(DRIVER, *(argument for parameter in parameters for argument in ("-p", parameter)))

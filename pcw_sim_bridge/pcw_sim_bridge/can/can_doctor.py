@@ -8,6 +8,7 @@ It opens the buses itself: no driver may run.
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from collections.abc import Sequence
 
@@ -60,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _list() -> int:
     from .python_can import available_buses
 
+    logging.getLogger("can").setLevel(logging.ERROR)  # what it lacks for the interfaces that are not here
     found = available_buses()
     for bus in found:
         print(", ".join(f"{key} {value}" for key, value in bus.items()))

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import State, TransitionCallbackReturn
@@ -31,7 +32,7 @@ from pcw_description.short_collections import short_collections
 
 from ..can.can_file import on_udp, read_can_file
 from ..can.can_robot import ENABLE_TIME, CanRobot, TimedReading
-from ..can.python_can import PythonCanTransport, free_log_name
+from ..can.python_can import PythonCanTransport, check_log_suffix, free_log_name
 from ..can.supervisor import Fault
 from .joint_command_messages import read_joint_command
 
@@ -68,6 +69,8 @@ class CanDriverNode(RobustLifecycleNode):
             self, "log", "", "write all frames to this .log, .asc or .blf; a number is added where it exists", read_only=True
         )
         all_declared(self)
+        if self._log_path:
+            check_log_suffix(Path(self._log_path))
         self.robot, self._file = robot, read_can_file(name, robot)
         if port:
             self._file = on_udp(self._file, port)
