@@ -69,6 +69,8 @@ def delay_margin(robot: RobotDescription, gain: FloatArray) -> FloatArray:
 def derived_bandwidth(robot: RobotDescription, wanted: float, delay: float = DELAY) -> float:
     """Return the bandwidth w [rad/s], at most `wanted`, whose k_p = 2 w m bears `delay` [s] at every wheel.
 
+    Where only a w below a part of `wanted` would, or none, it is that part, which does not bear it: `gain_check` says so.
+
     Args:
         robot: the robot.
         wanted: [rad/s].

@@ -60,9 +60,13 @@ def report(robot: RobotDescription, velocity_gain: float | None, delay: float) -
     advised = 2.0 * derived_bandwidth(robot, gain / 2.0, delay)
     # What is derived for a delay bears just that delay, to rounding.
     bears = bool(np.min(margins["computed torque"]) >= delay * (1.0 - 1e-9))
+    if float(np.min(delay_margin(robot, advised * mass))) >= delay * (1.0 - 1e-9):
+        advice = f"advised: {advised:.1f} 1/s"
+    else:
+        advice = "nor does any gain that still moves it: shorten the delay"
     lines.append(
         f"  least margin {1e3 * least:.2f} ms; velocity_gain {gain:.4g} 1/s{' (derived)' if velocity_gain is None else ''} "
-        + (f"bears {1e3 * delay:g} ms" if bears else f"does not bear {1e3 * delay:g} ms; advised: {advised:.1f} 1/s")
+        + (f"bears {1e3 * delay:g} ms" if bears else f"does not bear {1e3 * delay:g} ms; {advice}")
         + f"; RMRC and SME-RMRC derive {w:.1f} rad/s"
     )
     return lines, bears

@@ -1,5 +1,6 @@
 """How much delay a loop over a tyre bears: the closed form against a simulation of it, and the command."""
 
+import re
 from importlib.resources import files
 from pathlib import Path
 
@@ -84,7 +85,9 @@ def test_the_command_says_what_is_left_and_its_exit_code_what_is_borne(capsys, t
     assert gain_check.main(["thesis", "--write", str(tmp_path / "thesis.yaml")]) == 2
     assert "thesis.yaml: File exists; allowed: a folder" in capsys.readouterr().err
     assert gain_check.main(["thesis", "--velocity-gain", "150"]) == 1
-    assert "does not bear" in capsys.readouterr().out
+    assert re.search(r"does not bear 1 ms; advised: \d", capsys.readouterr().out)
+    assert gain_check.main(["tidybot2", "--delay", "0.01"]) == 1
+    assert "does not bear 10 ms; nor does any gain that still moves it" in capsys.readouterr().out
     assert gain_check.main([]) == 0  # what is derived is borne, by every shipped robot
     assert "does not bear" not in capsys.readouterr().out
     assert gain_check.main(["tidybot2", "--velocity-gain", "20"]) == 1
