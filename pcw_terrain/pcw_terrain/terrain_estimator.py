@@ -6,7 +6,7 @@ Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (s
 
 - all signals pass the same filter, two poles, and so does the derivative of the wheel's speed that (3.45) needs;
 - the slip is relaxed over the tyre's relaxation length like the force is;
-- the filtered signals are sampled so far apart that their noise is independent, as blocks;
+- the filtered signals are sampled so far apart that their noise is nearly independent, as blocks;
 - the noise of speeds and torques is measured from their second differences, and with it the filtered slip's, s, in lambda_p.
   It bends the curve's mean by g'' s^2 / 2, which is taken off:    g_c = g(x) - g''(x) s^2 / 2;
   The curve's mean is bent as well by slip that moves within the filter's memory, which is put back; what noise alone makes
@@ -16,14 +16,20 @@ Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (s
 
       sum w z (mu_k - mu_p g_c(x_k)) = 0,    sum w a (mu_k - mu_p g_c(x_k)) = 0,    z = g(x_i),  a = -x_i g'(x_i),
 
-  with the effective variance 1/w = s_mu^2 + mu_p^2 s^2 (g'^2 + g''^2 s^2) at the instrument's x_i. The sums are kept for a
-  grid of lambda_p, so that nothing is linearised and nothing can diverge: mu_p follows from the first equation, lambda_p is
-  where the second one holds, nearest to the least weighted error.
+  with the effective variance 1/w = s_mu^2 + mu_p^2 s^2 (g'^2 + g''^2 s^2) at the instrument's x_i. Noise of the slip that the
+  tyre has carried as far as the instrument (covariance c, in lambda_p^2) is taken off: z g_c - z' g' c for z g_c; a likewise.
+  The sums are kept for a grid of lambda_p, so that nothing is linearised and nothing can diverge: mu_p follows from the first
+  equation, lambda_p is where the second one holds, nearest to the least weighted error.
 
-The covariance is that of these equations, with the variance and the correlation of the residuals as they are. An estimate is
-valid when it is narrow enough, the slip has been beyond `least_slip` of the largest lambda_p that it allows, and the force
-acted along the slip and not against it. Residuals that add up to a jump mean that the ground changed: the estimate then
-begins anew from the blocks since.
+The covariance is that of these equations. Noise goes on from block to block: that of the slip with the same sign, and that of
+the wheel's acceleration with the opposite one, as what one block gains its neighbour loses, so that next to nothing of it is
+left in the sum. Both follow from the measured noise, filter and tyre (`block_shares`, `ends_share`), and so the variance of
+sum w z r is sum over k and l of w_k z_k w_l z_l C(k, l), and so on. What residuals are beyond that noise counts with the
+correlation that they have.
+
+An estimate is valid when it is narrow enough, the slip has been beyond `least_slip` of the largest lambda_p that it allows,
+and the force acted along the slip and not against it. Residuals that add up to a jump mean that the ground changed: the
+estimate then begins anew from the blocks since.
 """
 
 from __future__ import annotations
@@ -46,12 +52,12 @@ LEAST_CRITICAL_SLIP, GREATEST_CRITICAL_SLIP = 0.01, 0.8
 GRID = 64
 # A pole of the filter for a cut-off (-3 dB) of two equal ones, and the time between blocks in units of its time constant.
 POLE_PER_CUT_OFF, BLOCK_TIME_CONSTANTS = 2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0), 4.0
-# Of a mean over a block, relative to the filtered signal: the variance of the difference of its ends, and the spread of what
-# moves steadily through filter and block, in units of its way from block to block.
-_DECAY = math.exp(-BLOCK_TIME_CONSTANTS)
-BLOCK_ENDS_NOISE = 2.0 - 2.0 * (1.0 + BLOCK_TIME_CONSTANTS) * _DECAY
+# Of a mean over a block, relative to the filtered signal: the spread of what moves steadily through filter and block, in units
+# of its way from block to block.
 BLOCK_SPREAD = 2.0 / BLOCK_TIME_CONSTANTS**2 + 1.0 / 12.0
 SPECTRUM_POINTS = 32
+# Noise of a block is followed into so many blocks after it: tyres at 0.3 m/s carry a tenth of it as far.
+PAIRS = 8
 # The instrument is so many blocks older, and by the tyre's relaxation more.
 LEAST_LAG, RELAXATION_LAG = 2, 1.0
 # Noise below this part of the slip is none.
@@ -108,18 +114,21 @@ _CHANGES, _CHANGE_TIME, _SLIP, _FRICTION, _SLIP_NOISE, _OPENED, _CUMULATED = ran
 # the rolling speed at its beginning.
 _MEAN, _BLOCK_TIME, _BEGAN_AT = 45, 52, 53
 _RESULT = 54  # mu_p, lambda_p, variances of their logarithms and covariance, valid, misfit, reason
-_HISTORY, _BLOCK = 16, 10  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
-# instrument, whether it has been added, residual in standard deviations
+_HISTORY, _BLOCK = 16, 15  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
+# instrument, whether it has been added, residual in standard deviations; noise of the slip per unit of its gain, rate of the
+# tyre's relaxation (0: none), noise of the friction by the wheel's acceleration and by the force, sign of the force
 _KNOWN_FOR, _MISFITS = 62, 63  # time for which every reading has been known [s]; blocks in a row of which none fits
-_STATE = 64
-_SUMS = 13
+_TAKEN = 64  # blocks taken so far, modulo PAIRS; then time and sign of each of the last ones
+_STATE = _TAKEN + 1 + 2 * PAIRS
+_PAIRED = 17  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
+_SUMS = _PAIRED + 4 * PAIRS
 # Columns of what `TerrainEstimator.run` returns.
 RESULTS = 14
 MU_P, LAMBDA_P, MU_VARIANCE, COVARIANCE, LAMBDA_VARIANCE, IS_VALID, MISFIT, REASON, CHANGES, SLIP = range(10)
 FRICTION, SLIP_NOISE, SINCE_CHANGE, SUSPECT = range(10, RESULTS)
 (
-    _ZZ, _ZA, _AA, _ZY, _ZG, _AY, _AG, _YY, _GY, _GG, _LOG, _BEYOND, _W,
-) = range(13)  # fmt: skip
+    _ZZ, _ZA, _AA, _ZY, _ZG, _AY, _AG, _YY, _GY, _GG, _LOG, _BEYOND, _W, _NOISE_ZZ, _NOISE_ZA, _NOISE_AA, _NOISE_SHARE,
+) = range(_PAIRED)  # fmt: skip
 
 # Why an estimate is not valid, or 0.
 VALID, TOO_FEW, TOO_LITTLE_SLIP, TOO_WIDE, WRONG_SIGN, NO_FIT, AT_A_BOUND = range(7)
@@ -285,6 +294,41 @@ def block_share(pole, rate, time, apart):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def block_shares(pole, rate, time, shares):  # type: ignore[no-untyped-def]
+    """Fill shares (m,) with `block_share` of means that begin 0, 1, ... m - 1 times `time` from each other."""
+    shares[:] = 0.0
+    all_of_it = 0.0
+    for k in range(SPECTRUM_POINTS):
+        angle = (k + 0.5) * 0.5 * math.pi / SPECTRUM_POINTS
+        omega = pole * math.tan(angle)
+        density = math.cos(angle) ** 2
+        half = 0.5 * omega * time
+        passed = density * (math.sin(half) / half) ** 2 / (1.0 + (omega / rate) ** 2)
+        all_of_it += density
+        # cos(m a) from the two before it.
+        twice = 2.0 * math.cos(omega * time)
+        before, now = 0.5 * twice, 1.0
+        for m in range(len(shares)):
+            shares[m] += passed * now
+            before, now = now, twice * now - before
+    shares /= all_of_it
+
+
+@compiled
+def ends_share(apart):  # type: ignore[no-untyped-def]
+    """Return the covariance of the differences of two blocks' ends that lie `apart` blocks from each other.
+
+    In units of the filtered noise's variance, whose correlation over u time constants is (1 + u) exp(-u). What one block
+    gains its neighbour loses: the sum over all blocks is nothing.
+    """
+    total = 0.0
+    for shift, factor in ((0.0, 2.0), (-1.0, -1.0), (1.0, -1.0)):
+        u = abs(apart + shift) * BLOCK_TIME_CONSTANTS
+        total += factor * (1.0 + u) * math.exp(-u)
+    return total
+
+
+@compiled
 def _smooth(state, index, value, share):  # type: ignore[no-untyped-def]
     state[index] += share * (value - state[index])
     state[index + 1] += share * (state[index] - state[index + 1])
@@ -296,23 +340,45 @@ def _grid(j):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_block(  # type: ignore[no-untyped-def]
-    table, numbers, state, sums, lag, slip, slip_variance, friction, friction_variance, bending, averaged, spread
-):
-    """Add one block to the sums of every lambda_p; `lag` is the instrument's slip, `averaged` that around it."""
+def _add_block(table, numbers, state, sums, now, lag, lag_signs, averaged, spread):  # type: ignore[no-untyped-def]
+    """Add one block of the history to the sums of every lambda_p.
+
+    `lag` is the instrument's slip, the mean of two blocks, each along its own force; `lag_signs` is 1 if both forces point the
+    way that this block's does, 0 if one does, -1 if none. `averaged` is the slip around the block, `spread` the deviation of
+    that.
+    """
+    slip, slip_variance, friction, friction_variance, bending = now[0], now[1], now[2], now[3], now[6]
+    pole = POLE_PER_CUT_OFF * numbers[_CUT_OFF]
+    time = BLOCK_TIME_CONSTANTS / pole
+    relaxing = now[11] if now[11] > 0.0 else math.inf
+    # Covariances of the noise of this block with that of blocks before it, of slip and friction.
+    of_slip, of_force, of_friction = np.empty(PAIRS), np.empty(3), np.zeros(PAIRS)
+    block_shares(pole, relaxing, time, of_slip)
+    block_shares(pole, math.inf, time, of_force)
+    of_slip *= now[10]
+    for m in range(3):
+        of_friction[m] = now[12] * ends_share(m) + now[13] * of_force[m]
+    shared = lag_signs * of_slip[min(max(int(now[7]), LEAST_LAG), PAIRS - 1)]
     best = state[_RESULT + 1]
     informative = 1.0
     if best > 0.0:
         informative = min(1.0, max(abs(lag), abs(slip)) / (INFORMATIVE_SLIP * best))
-    keep = math.exp(-informative * BLOCK_TIME_CONSTANTS / (POLE_PER_CUT_OFF * numbers[_CUT_OFF]) / numbers[_MEMORY])
+    keep = math.exp(-informative * time / numbers[_MEMORY])
     state[_WEIGHT] = keep * state[_WEIGHT] + 1.0
     state[_BLOCKS] += 1.0
+    taken = int(state[_TAKEN])
+    # How many blocks ago the last ones were, and whether the force had the same sign.
+    ago, alike = np.zeros(PAIRS, np.int64), np.zeros(PAIRS)
+    for i in range(PAIRS):
+        ago[i] = round(abs(now[4] - state[_TAKEN + 1 + 2 * i]) / time)
+        alike[i] = now[14] * state[_TAKEN + 2 + 2 * i]
     for j in range(GRID):
         critical = _grid(j)
         x, x_lag = slip / critical, lag / critical
-        s2 = slip_variance / (critical * critical)
-        g, _, bend = shape_at(table, x)
-        corrected = g - 0.5 * bend * bending / (critical * critical)
+        per_square = 1.0 / (critical * critical)
+        s2 = slip_variance * per_square
+        g, slope_now, bend = shape_at(table, x)
+        corrected = g - 0.5 * bend * bending * per_square
         z, slope, bend_lag = shape_at(table, x_lag)
         a = -x_lag * slope
         mu = 0.5
@@ -320,22 +386,49 @@ def _add_block(  # type: ignore[no-untyped-def]
             mu = min(max(sums[j, _ZY] / sums[j, _ZG], LEAST_FRICTION), GREATEST_FRICTION)
         variance = friction_variance + mu * mu * s2 * (slope * slope + bend_lag * bend_lag * s2)
         w = 1.0 / variance
-        for k in range(_SUMS):
+        # How well the curve fits is judged by the slope at the block itself as well: weights that know its noise would bias.
+        steep, bent = max(slope * slope, slope_now * slope_now), max(bend * bend, bend_lag * bend_lag)
+        spread_here = friction_variance + mu * mu * s2 * (steep + 0.5 * bent * s2)
+        sure = 1.0 / spread_here
+        for k in range(_PAIRED):
             sums[j, k] *= keep
         sums[j, _ZZ] += w * z * z
         sums[j, _ZA] += w * z * a
         sums[j, _AA] += w * a * a
         sums[j, _ZY] += w * z * friction
-        sums[j, _ZG] += w * z * corrected
+        sums[j, _ZG] += w * (z * corrected - slope * slope_now * shared * per_square)
         sums[j, _AY] += w * a * friction
-        sums[j, _AG] += w * a * corrected
-        sums[j, _YY] += w * friction * friction
-        sums[j, _GY] += w * corrected * friction
-        sums[j, _GG] += w * corrected * corrected
-        sums[j, _LOG] += math.log(variance)
+        sums[j, _AG] += w * (a * corrected + (slope + x_lag * bend_lag) * slope_now * shared * per_square)
+        sums[j, _YY] += sure * friction * friction
+        sums[j, _GY] += sure * corrected * friction
+        sums[j, _GG] += sure * corrected * corrected
+        sums[j, _LOG] += math.log(spread_here)
         sums[j, _W] += 1.0
         if abs(averaged) - 3.0 * spread >= numbers[_LEAST_SLIP] * critical:
             sums[j, _BEYOND] += 1.0
+        # What the measured noise of this block and of those before it makes of both equations. The square of a slope that was
+        # taken at a noisy slip is too large by bend^2 noise; what noise does by the bend itself is half of that.
+        noise = of_slip[0] * per_square
+        own = of_friction[0] + mu * mu * noise * (slope_now * slope_now - 0.5 * bend * bend * noise)
+        p, q = w * z, w * a
+        sums[j, _NOISE_ZZ] += own * p * p
+        sums[j, _NOISE_ZA] += own * p * q
+        sums[j, _NOISE_AA] += own * q * q
+        sums[j, _NOISE_SHARE] += own * w
+        for i in range(PAIRS):
+            m = ago[i]
+            if 0 < m < PAIRS:
+                at = _PAIRED + 4 * i
+                noise = of_slip[m] * per_square
+                both = mu * mu * noise * (slope_now * sums[j, at + 2] - 0.5 * bend * sums[j, at + 3] * noise)
+                both = alike[i] * (both + of_friction[m])
+                sums[j, _NOISE_ZZ] += 2.0 * both * p * sums[j, at]
+                sums[j, _NOISE_ZA] += both * (p * sums[j, at + 1] + q * sums[j, at])
+                sums[j, _NOISE_AA] += 2.0 * both * q * sums[j, at + 1]
+        at = _PAIRED + 4 * taken
+        sums[j, at], sums[j, at + 1], sums[j, at + 2], sums[j, at + 3] = p, q, slope_now, bend
+    state[_TAKEN + 1 + 2 * taken], state[_TAKEN + 2 + 2 * taken] = now[4], now[14]
+    state[_TAKEN] = (taken + 1) % PAIRS
 
 
 @compiled
@@ -396,14 +489,19 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
     count = state[_WEIGHT]
     squares = sums[j, _YY] - 2.0 * mu * sums[j, _GY] + mu * mu * sums[j, _GG]
     scale = (PRIOR_BLOCKS + max(squares, 0.0)) / (PRIOR_BLOCKS + max(count - 2.0, 0.0))
-    correlation = min(max(state[_CORRELATION], -0.3), 0.8)
-    # Of a moving average, or of a memory that fades.
-    inflated = scale * (1.0 + 2.0 * correlation if correlation < 0.0 else (1.0 + correlation) / (1.0 - correlation))
+    # Noise that was measured counts as it goes from block to block; what the residuals are beyond it goes together as they do.
+    explained = sums[j, _NOISE_SHARE] / max(sums[j, _W], 1.0)
+    noise, rest = min(1.0, scale / max(explained, 1e-12)), max(scale - explained, 0.0)
+    correlation = min(max(state[_CORRELATION], 0.0), 0.8)
+    rest *= (1.0 + correlation) / (1.0 - correlation)
+    zz = noise * max(sums[j, _NOISE_ZZ], 0.0) + rest * sums[j, _ZZ]
+    za = noise * sums[j, _NOISE_ZA] + rest * sums[j, _ZA]
+    aa = noise * max(sums[j, _NOISE_AA], 0.0) + rest * sums[j, _AA]
     share = sums[j, _AG] / sums[j, _ZG]
-    h_variance = max(sums[j, _AA] - 2.0 * share * sums[j, _ZA] + share * share * sums[j, _ZZ], 1e-300)
-    slip_variance = inflated * h_variance / (slope * slope)
-    own = inflated * sums[j, _ZZ] / (sums[j, _ZG] * mu) ** 2
-    together = inflated * (sums[j, _ZA] - share * sums[j, _ZZ]) / (sums[j, _ZG] * mu)
+    h_variance = max(aa - 2.0 * share * za + share * share * zz, 1e-300)
+    slip_variance = h_variance / (slope * slope)
+    own = zz / (sums[j, _ZG] * mu) ** 2
+    together = (za - share * zz) / (sums[j, _ZG] * mu)
     mu_variance = own + follows * follows * slip_variance - 2.0 * follows / slope * together
     covariance = follows * slip_variance - together / slope
     systematic = (numbers[_SLIP_ACCURACY] / critical) ** 2
@@ -461,7 +559,8 @@ def _take(table, numbers, state, sums, history, last, begin):  # type: ignore[no
         # Neighbours are correlated by filter and tyre, which widens their mean by a half.
         spread = 1.5 * math.sqrt(spread) / (2 * LEAST_LAG + 1)
         instrument = 0.5 * (history[index - lag, 0] + history[index + lag, 0])
-        _add_block(table, numbers, state, sums, instrument, now[0], now[1], now[2], now[3], now[6], averaged, spread)
+        signs = 0.5 * now[14] * (history[index - lag, 14] + history[index + lag, 14])
+        _add_block(table, numbers, state, sums, now, instrument, signs, averaged, spread)
 
 
 @compiled
@@ -541,7 +640,6 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     now[:] = 0.0
     force = math.hypot(force_x, force_y)
     full_gain = noise_gain(pole, dt)
-    gain = full_gain * block_share(pole, math.inf, state[_BLOCK_TIME], 0.0)
     settled, slip_now = state[_NOISE_TIME] > NOISE_SETTLED, mean[5]
     usable = settled and abs(slip_now) <= 1.0 and speed > numbers[_LEAST_SPEED] and load > numbers[_LEAST_LOAD] and force > 0.0
     usable = usable and state[_KNOWN_FOR] >= KNOWN_BLOCKS * BLOCK_TIME_CONSTANTS / pole
@@ -564,12 +662,15 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
         relaxed_blocks = math.ceil(RELAXATION_LAG * numbers[_RELAXATION] / speed * pole / BLOCK_TIME_CONSTANTS)
     # Of the slip per unit of its gain: filter and tyre carry noise from one block to the next, and to its difference from it.
     noise = full_gain * (other * other * larger + smaller) / (speed * speed) * along * along
-    slip_variance = noise * block_share(pole, relaxing, state[_BLOCK_TIME], 0.0) + 1e-10
-    together = noise * block_share(pole, relaxing, state[_BLOCK_TIME], state[_BLOCK_TIME])
+    slip_shares, force_shares = np.empty(2), np.empty(1)
+    block_shares(pole, relaxing, state[_BLOCK_TIME], slip_shares)
+    block_shares(pole, math.inf, state[_BLOCK_TIME], force_shares)
+    slip_variance, together = noise * slip_shares[0] + 1e-10, noise * slip_shares[1]
     friction = sign * force / load
     per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
-    ends = full_gain * BLOCK_ENDS_NOISE * per_time * per_time * state[_NOISE]
-    friction_variance = (gain * state[_NOISE + 2] + ends) / (load * load)
+    ends_unit = full_gain * per_time * per_time * state[_NOISE] / (load * load)
+    force_unit = full_gain * state[_NOISE + 2] / (load * load)
+    friction_variance = ends_unit * ends_share(0.0) + force_unit * force_shares[0]
     accuracy = max(numbers[_FRICTION_ACCURACY], 0.002) * friction
     friction_variance += accuracy * accuracy + 1e-10
     now[0], now[1], now[2], now[3], now[4], now[5] = slip, slip_variance, friction, friction_variance, state[_TIME], 1.0
@@ -578,6 +679,8 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     now[7] = min(LEAST_LAG + relaxed_blocks if noisy else LEAST_LAG, (_HISTORY - 1) // 2)
     # What does not average out spreads the residuals as well.
     now[1] += numbers[_SLIP_ACCURACY] ** 2
+    now[10], now[11], now[12], now[13] = noise, relaxing if relaxing < math.inf else 0.0, ends_unit, force_unit
+    now[14] = sign
     # The mean of a curve is bent by noise, and the mean friction by slip that moves within the filter's memory, 2 / pole^2.
     now[6] = slip_variance
     if history[_HISTORY - 2, 5] > 0.0:

@@ -32,6 +32,8 @@ from pcw_terrain.terrain_estimator import (
     REASON,
     WRONG_SIGN,
     block_share,
+    block_shares,
+    ends_share,
     noise_gain,
 )
 
@@ -125,6 +127,26 @@ def test_braking_and_driving_backwards_give_the_same_as_driving():
     np.testing.assert_allclose(forth[:IS_VALID], back[:IS_VALID], rtol=1e-9)
 
 
+@pytest.mark.parametrize("case", ["thesis", "swept"])
+def test_intervals_are_as_wide_as_the_errors(case):
+    """Errors over their standard deviations scatter by 1; 150 of them tell that to 6 %. The noise of the wheel's acceleration,
+    which cancels from block to block, was once counted as if it did not: 0.6 for mu_p with the settings of the thesis. At low
+    speed, where the tyre carries the slip's noise from block to block, the other way: 1.1 for lambda_p.
+    """
+    over = []
+    for seed in range(20_000, 20_200):
+        wheel, run = thesis_run(seed) if case == "thesis" else swept_run(seed, (1.0, 2.0))
+        last = estimator_of(wheel).run(readings_of(wheel, run), 1.0 / RATE, 10)[-1]
+        if last[IS_VALID] and np.abs(run.slip_ratio).max() >= wheel.contact.lambda_p:
+            error = np.log([last[MU_P] / wheel.contact.mu_p, last[LAMBDA_P] / wheel.contact.lambda_p])
+            over.append(error / np.sqrt([last[MU_VARIANCE], last[LAMBDA_VARIANCE]]))
+    assert len(over) > 140
+    size = np.sqrt(np.mean(np.square(over), axis=0))
+    held = (np.abs(over) < 1.96).mean(axis=0)
+    assert (size > 0.75).all() and (size < 1.2).all(), size
+    assert (held > 0.9).all() and (held < 0.99).all(), held
+
+
 # --- Honesty ----------------------------------------------------------------------------------------------
 
 
@@ -155,6 +177,14 @@ def test_a_suspicion_that_chance_began_carries_nothing_into_the_new_estimate():
     for seed in (39, 138, 171):
         found = terrain_study.change_times(range(seed, seed + 1))
         assert found.detected.max() <= 0.3 and found.settled.max() <= 0.8
+
+
+@pytest.mark.parametrize("seed", [3053, 7186])
+def test_blocks_on_the_steep_part_do_not_pass_for_a_misfit(seed):
+    """Where the slip moves fast its instrument may be at the peak while the block is not. Judged by the slope at the
+    instrument alone such a block lay far off the curve; the misfit stayed high, and a change took 0.35 s to be noticed.
+    """
+    assert terrain_study.change_times(range(seed, seed + 1)).detected.max() <= 0.3
 
 
 def test_what_no_curve_fits_is_given_up():
@@ -321,6 +351,29 @@ def test_noise_that_the_filter_leaves_is_what_it_is_said_to_be(dt):
         assert means.var() == pytest.approx(variance, rel=0.08)
         assert np.cov(means[1:], means[:-1])[0, 1] == pytest.approx(covariance, abs=0.06 * variance)
         assert covariance > 0.15 * variance
+
+
+def test_the_noise_of_several_blocks_is_that_of_each_pair():
+    shares, pole, time = np.empty(6), 195.0, BLOCK_TIME_CONSTANTS / 195.0
+    for rate in (15.0, 80.0, math.inf):
+        block_shares(pole, rate, time, shares)
+        np.testing.assert_allclose(shares, [block_share(pole, rate, time, m * time) for m in range(6)], atol=1e-12)
+
+
+def test_what_the_noise_of_an_acceleration_gives_one_block_it_takes_from_its_neighbours():
+    """Differences of the ends of blocks: covariances as 4e5 readings tell them, and their sum over all blocks is nothing."""
+    rng, pole, dt = np.random.default_rng(0), 195.0, 0.0005
+    x = rng.standard_normal(400_000)
+    for share in 2 * (1.0 - math.exp(-pole * dt),):
+        x = _low_pass(x, share)
+    length = round(BLOCK_TIME_CONSTANTS / pole / dt)
+    differences = np.diff(x[::length])
+    gain = noise_gain(pole, dt)
+    for apart in range(4):
+        covariance = float(np.mean(differences[apart:] * differences[: len(differences) - apart]))
+        assert covariance == pytest.approx(gain * ends_share(apart), abs=0.05 * gain)
+    assert ends_share(0) + 2.0 * sum(ends_share(m) for m in range(1, 12)) == pytest.approx(0.0, abs=1e-9)
+    assert ends_share(1) < -0.4 * ends_share(0)
 
 
 def _low_pass(x, share):
