@@ -338,6 +338,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.seeds < 1:
         parser.error(f"argument --seeds: {options.seeds} is not allowed; allowed: at least 1")
+    if options.out.is_dir():
+        parser.error(f"argument --out: {options.out} is a folder; allowed: the file to write")
     text = document(options.plants, range(options.first_seed, options.first_seed + options.seeds))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(text, encoding="utf-8")

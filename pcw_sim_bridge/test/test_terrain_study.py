@@ -120,3 +120,11 @@ def test_the_study_writes_its_document(tmp_path, monkeypatch):
     assert terrain_study.main(["--seeds", "2", "--plants", "reduced", "--out", str(out)]) == 0
     rows = [line for line in out.read_text().splitlines() if line.startswith("| reduced")]
     assert len(rows) == 2 and "3.00 s" in rows[0]
+
+
+def test_a_folder_to_write_to_is_refused_before_the_runs(tmp_path, monkeypatch, capsys):
+    """It was found out after all runs, by a traceback, and they were lost."""
+    monkeypatch.setattr(terrain_study, "active_run", lambda *_: pytest.fail("it ran"))
+    with pytest.raises(SystemExit) as ended:
+        terrain_study.main(["--seeds", "1", "--out", str(tmp_path)])
+    assert ended.value.code == 2 and "is a folder" in capsys.readouterr().err

@@ -77,6 +77,8 @@ UNSTEADY_SLIP = 0.25
 MOVING_ACCURACY = 0.1
 # Degrees of freedom that the expected size of the residuals counts for, besides those of the residuals.
 PRIOR_BLOCKS = 5.0
+# Mean squares of residuals that are larger by so many of their standard deviations may be so by chance.
+CHANCE = 2.0
 # Residuals beyond so many standard deviations count as that many; so much of each is allowed for, and so much must add up.
 LARGEST_RESIDUAL, ALLOWED_RESIDUAL, CHANGE_THRESHOLD = 4.0, 1.0, 16.0
 # From this sum on nothing more is learned until it is decided; blocks wait in the history, so long.
@@ -489,9 +491,11 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
     count = state[_WEIGHT]
     squares = sums[j, _YY] - 2.0 * mu * sums[j, _GY] + mu * mu * sums[j, _GG]
     scale = (PRIOR_BLOCKS + max(squares, 0.0)) / (PRIOR_BLOCKS + max(count - 2.0, 0.0))
-    # Noise that was measured counts as it goes from block to block; what the residuals are beyond it goes together as they do.
+    # Noise that was measured counts as it goes from block to block; what the residuals are beyond it, and beyond what chance
+    # makes of so many, goes together as they do.
     explained = sums[j, _NOISE_SHARE] / max(sums[j, _W], 1.0)
-    noise, rest = min(1.0, scale / max(explained, 1e-12)), max(scale - explained, 0.0)
+    noise = min(1.0 + CHANCE * math.sqrt(2.0 / max(count, 1.0)), scale / max(explained, 1e-12))
+    rest = max(scale - noise * explained, 0.0)
     correlation = min(max(state[_CORRELATION], 0.0), 0.8)
     rest *= (1.0 + correlation) / (1.0 - correlation)
     zz = noise * max(sums[j, _NOISE_ZZ], 0.0) + rest * sums[j, _ZZ]
