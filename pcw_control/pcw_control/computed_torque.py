@@ -24,11 +24,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from pcw_description.augmented_object_model import AugmentedObjectModel
+from pcw_description.augmented_object_model import AugmentedObjectModel, augmented_object_kernel
+from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import (
     forward_kinematics_kernel,
     joint_matrix_blocks,
@@ -43,14 +44,12 @@ from .controller_interface import (
     Reference,
     TwistReference,
     check_step,
-    internal_force_kernel,
-    joint_torque_kernel,
+    output_kernel,
     parameter,
 )
 from .delay_margin import BANDWIDTH, DELAY, derived_bandwidth
 from .errors import ControlError
-from .quintic_trajectory import TrajectoryPoint
-from .reference_motion import MotionParameters, ReferenceMotion
+from .reference_motion import MotionParameters, ReferenceMotion, towards_kernel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,9 +99,10 @@ class ComputedTorqueState:
     error_integral: FloatArray
 
 
-@dataclasses.dataclass(frozen=True)
-class Demand:
+class Demand(NamedTuple):
     """What the wheels shall do together in this cycle, and the geometry of it.
+
+    A named tuple because one is made on every cycle, and a frozen dataclass of as many fields takes four times as long.
 
     Attributes:
         wrench: operational force F (3,) [N, N, N m] in base_link.
@@ -178,48 +178,45 @@ class ComputedTorque:
         self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
     ) -> tuple[ComputedTorqueState, Demand]:
         """Return the operational force F that the reference asks for."""
-        steer_angle = np.ascontiguousarray(measurement.joint_position[:, STEER])
-        A = wheel_jacobian_kernel(*self._geometry, steer_angle)
-        V, incompatibility, normal_inverse = forward_kinematics_kernel(
-            *self._geometry, self._radius, steer_angle, np.ascontiguousarray(measurement.joint_velocity)
-        )
         if isinstance(reference, ForceReference):
             raise ControlError(
                 f"a ForceReference is not allowed for {type(self).__name__}; allowed: TwistReference, TrajectoryPoint"
             )
+        p = self.parameters
+        position = np.ascontiguousarray(measurement.joint_position, dtype=np.float64)
+        velocity = np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64)
         if isinstance(reference, TwistReference):
-            state, V_dot = self._towards_twist(state, reference.twist, V, A, steer_angle, measurement, dt)
+            steer_angle, A, V, incompatibility, normal_inverse, V_d, V_dot_d = _approach(
+                *self._geometry, self._radius, position, velocity, state.reference_twist, reference.twist, dt,
+                *self._reference_motion.numbers,
+            )  # fmt: skip
+            part = self._carried(V_d, V_dot_d, A, steer_angle, measurement)
+            V_d, e, inertia, bias, F = _follow_twist(
+                *self._model.numbers, steer_angle, V, state.reference_twist, V_d, V_dot_d, part, state.error_integral,
+                measurement.saturated, self._largest_integral, p.integral_gain, p.velocity_gain, dt,
+            )  # fmt: skip
         else:
-            state, V_dot = self._towards_point(state, reference, measurement.pose, V)
-        inertia, bias = self._model.evaluate(steer_angle, V)
-        return state, Demand(inertia @ V_dot + bias, V, steer_angle, A, normal_inverse, inertia, bias, incompatibility)
+            steer_angle, A, V, incompatibility, normal_inverse = kinematics_kernel(
+                *self._geometry, self._radius, position, velocity
+            )
+            V_d, inertia, bias, F = _follow_point(
+                *self._model.numbers, steer_angle, V, measurement.pose, reference.pose, reference.velocity,
+                reference.acceleration, p.position_gain, p.velocity_gain,
+            )  # fmt: skip
+            # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
+            e = np.zeros(3)
+        state = dataclasses.replace(state, reference_twist=V_d, error_integral=e)
+        return state, Demand(F, V, steer_angle, A, normal_inverse, inertia, bias, incompatibility)
 
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
     ) -> tuple[ComputedTorqueState, FloatArray]:
         """Return contact forces (n, 2) in the wheel frames that make the wrench: (5.6), without internal force."""
-        return state, (demand.A @ (demand.normal_inverse @ demand.wrench)).reshape(self._n, 2)
+        return state, _least_forces(demand.A, demand.normal_inverse, demand.wrench)
 
     def _output(self, state: ComputedTorqueState, demand: Demand, F_con: FloatArray) -> ControllerOutput:
-        tau = joint_torque_kernel(self._B, F_con)
-        internal = internal_force_kernel(*self._geometry, demand.steer_angle, F_con)
+        tau, internal = output_kernel(self._B, *self._geometry, demand.steer_angle, F_con)
         return ControllerOutput(tau, F_con, demand.wrench, demand.twist, state.reference_twist, internal)
-
-    def _towards_twist(
-        self, state: ComputedTorqueState, target: FloatArray, V: FloatArray, A: FloatArray, steer_angle: FloatArray,
-        measurement: ControllerMeasurement, dt: float,
-    ) -> tuple[ComputedTorqueState, FloatArray]:
-        p = self.parameters
-        V_d, V_dot_d = self._reference_motion.towards(state.reference_twist, target, A, dt)
-        part = self._carried(V_d, V_dot_d, A, steer_angle, measurement)
-        if part < 1.0:
-            V_d, V_dot_d = state.reference_twist + part * (V_d - state.reference_twist), part * V_dot_d
-        e_dot = V_d - V
-        e = state.error_integral
-        if not measurement.saturated and p.integral_gain > 0.0:
-            e = np.minimum(np.maximum(e + e_dot * dt, -self._largest_integral), self._largest_integral)
-        state = dataclasses.replace(state, reference_twist=V_d, error_integral=e)
-        return state, V_dot_d + p.integral_gain * e + p.velocity_gain * e_dot
 
     def _carried(
         self, V_d: FloatArray, V_dot_d: FloatArray, A: FloatArray, steer_angle: FloatArray, measurement: ControllerMeasurement
@@ -227,20 +224,90 @@ class ComputedTorque:
         """Return the part of the wanted change of the twist that the ground is asked for; here all of it."""
         return 1.0
 
-    def _towards_point(
-        self, state: ComputedTorqueState, point: TrajectoryPoint, pose: FloatArray, V: FloatArray
-    ) -> tuple[ComputedTorqueState, FloatArray]:
-        p = self.parameters
-        R_T = _rotation(-pose[2])
-        e = point.pose - pose
-        e[2] = math.remainder(e[2], math.tau)
-        V_d = R_T @ point.velocity
-        omega_cross_V = np.array([-V[2] * V[1], V[2] * V[0], 0.0])
-        V_dot = R_T @ (point.acceleration + p.position_gain * e) + p.velocity_gain * (V_d - V) - omega_cross_V
-        # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
-        return dataclasses.replace(state, reference_twist=V_d, error_integral=np.zeros(3)), V_dot
+
+@compiled
+def kinematics_kernel(steer_axis, caster_offset, radius, position, velocity):  # type: ignore[no-untyped-def]
+    """Return headings (n,), A (2n, 3), V (3,), (I - A A^+) B q_dot (n, 2) and (A^T A)^-1 (3, 3)."""
+    steer_angle = np.empty(len(position))
+    for i in range(len(position)):
+        steer_angle[i] = position[i, STEER]
+    A = wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle)
+    V, incompatibility, normal_inverse = forward_kinematics_kernel(steer_axis, caster_offset, radius, steer_angle, velocity)
+    return steer_angle, A, V, incompatibility, normal_inverse
 
 
-def _rotation(angle: float) -> FloatArray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+@compiled
+def _approach(  # type: ignore[no-untyped-def]
+    steer_axis, caster_offset, radius, position, velocity, reference, target, dt, B_inverse, speed_limit, offset, numbers
+):
+    """As `kinematics_kernel`, and the next reference twist V_d (3,) and its derivative (3,) on the way to a target (3,)."""
+    steer_angle, A, V, incompatibility, normal_inverse = kinematics_kernel(
+        steer_axis, caster_offset, radius, position, velocity
+    )
+    V_d, V_dot_d = towards_kernel(reference, target, A, dt, B_inverse, speed_limit, offset, numbers)
+    return steer_angle, A, V, incompatibility, normal_inverse, V_d, V_dot_d
+
+
+@compiled
+def _follow_twist(  # type: ignore[no-untyped-def]
+    chassis, modules, steer_axis, caster_offset, steer_angle, V, before, V_d, V_dot_d, part, integral, hold, largest,
+    integral_gain, velocity_gain, dt,
+):
+    """Return V_d, e (3,), Lambda, theta and F = Lambda (V_dot_d + k_p e + k_d e_dot) + theta for e_dot = V_d - V."""
+    wanted, e, V_dot = np.empty(3), integral.copy(), np.empty(3)
+    for i in range(3):
+        # Where the ground carries only a part of the change.
+        wanted[i] = V_d[i] if part >= 1.0 else before[i] + part * (V_d[i] - before[i])
+        e_dot = wanted[i] - V[i]
+        if not hold and integral_gain > 0.0:
+            e[i] = min(max(integral[i] + e_dot * dt, -largest[i]), largest[i])
+        V_dot[i] = min(part, 1.0) * V_dot_d[i] + integral_gain * e[i] + velocity_gain * e_dot
+    inertia, bias = augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_angle, V)
+    return wanted, e, inertia, bias, _wrench(inertia, V_dot, bias)
+
+
+@compiled
+def _follow_point(  # type: ignore[no-untyped-def]
+    chassis, modules, steer_axis, caster_offset, steer_angle, V, pose, pose_d, velocity_d, acceleration_d, position_gain,
+    velocity_gain,
+):
+    """Return V_d (3,), Lambda, theta and F of a point of a trajectory in odom; see the module's docstring."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    e = pose_d - pose
+    e[2] -= math.tau * math.floor(e[2] / math.tau + 0.5)
+    V_d, V_dot = _turned(c, s, velocity_d), _turned(c, s, acceleration_d + position_gain * e)
+    V_dot += velocity_gain * (V_d - V)
+    V_dot[0] += V[2] * V[1]
+    V_dot[1] -= V[2] * V[0]
+    inertia, bias = augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_angle, V)
+    return V_d, inertia, bias, _wrench(inertia, V_dot, bias)
+
+
+@compiled
+def _turned(c, s, vector):  # type: ignore[no-untyped-def]
+    """Return a vector (3,) of odom in base_link, whose heading has cosine c and sine s."""
+    turned = vector.copy()
+    turned[0], turned[1] = c * vector[0] + s * vector[1], c * vector[1] - s * vector[0]
+    return turned
+
+
+@compiled
+def _wrench(inertia, V_dot, bias):  # type: ignore[no-untyped-def]
+    F = bias.copy()
+    for i in range(3):
+        for j in range(3):
+            F[i] += inertia[i, j] * V_dot[j]
+    return F
+
+
+@compiled
+def _least_forces(A, normal_inverse, wrench):  # type: ignore[no-untyped-def]
+    """Return A (A^T A)^-1 F (n, 2)."""
+    force = np.empty((len(A) // 2, 2))
+    x = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            x[i] += normal_inverse[i, j] * wrench[j]
+    for k in range(len(A)):
+        force[k // 2, k % 2] = A[k, 0] * x[0] + A[k, 1] * x[1] + A[k, 2] * x[2]
+    return force

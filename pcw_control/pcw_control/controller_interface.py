@@ -213,6 +213,26 @@ def check_step(measurement: ControllerMeasurement, reference: Reference, dt: flo
     """
     if not (math.isfinite(dt) and dt > 0.0):
         raise ControlError(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
+    # One call looks at all numbers; only where something is wrong is it looked for.
+    m, motion = measurement, reference.motion if isinstance(reference, ForceReference) else reference
+    wrench = reference.wrench if isinstance(reference, ForceReference) else _NOTHING
+    if isinstance(motion, TwistReference):
+        last = (motion.twist, _NOTHING, _NOTHING, _NOTHING)
+    else:
+        last = (m.pose, motion.pose, motion.velocity, motion.acceleration)
+    if (
+        m.joint_position.shape == m.joint_velocity.shape == (n, 2)
+        and (m.slip is None or m.slip.shape == (n, 2))
+        and _have_length(n, m.friction, m.critical_slip, m.normal_force)
+        and _have_length(3, m.external_wrench, wrench, *last)
+        and _all_finite(
+            m.joint_position.ravel(), m.joint_velocity.ravel(), _NOTHING if m.slip is None else m.slip.ravel(),
+            _NOTHING if m.friction is None else m.friction, _NOTHING if m.critical_slip is None else m.critical_slip,
+            _NOTHING if m.normal_force is None else m.normal_force,
+            _NOTHING if m.external_wrench is None else m.external_wrench, wrench, *last,
+        )
+    ):  # fmt: skip
+        return
     _require("joint_position", measurement.joint_position, (n, 2))
     _require("joint_velocity", measurement.joint_velocity, (n, 2))
     optional = (
@@ -235,16 +255,35 @@ def check_step(measurement: ControllerMeasurement, reference: Reference, dt: flo
 
 
 def _require(name: str, values: FloatArray, shape: Sequence[int]) -> None:
-    if values.shape != shape or not _all_finite(values.ravel()):
+    if values.shape != shape or not np.isfinite(values).all():
         raise ControlError(f"{name} = {values.tolist()} is not allowed; allowed: finite numbers, shape {tuple(shape)}")
 
 
+_NOTHING = np.zeros(0)
+
+
+def _have_length(length: int, *arrays: FloatArray | None) -> bool:
+    for values in arrays:
+        if values is not None and values is not _NOTHING and values.shape != (length,):
+            return False
+    return True
+
+
 @compiled
-def _all_finite(values):  # type: ignore[no-untyped-def]
+def _finite(values):  # type: ignore[no-untyped-def]
     for k in range(len(values)):
         if not math.isfinite(values[k]):
             return False
     return True
+
+
+@compiled
+def _all_finite(a, b, c, d, e, f, g, h, i, j, k, m):  # type: ignore[no-untyped-def]
+    """Whether twelve arrays (k,), of any lengths and types, hold finite numbers only."""
+    return (
+        _finite(a) and _finite(b) and _finite(c) and _finite(d) and _finite(e) and _finite(f)
+        and _finite(g) and _finite(h) and _finite(i) and _finite(j) and _finite(k) and _finite(m)
+    )  # fmt: skip
 
 
 def internal_forces(
@@ -287,6 +326,12 @@ def internal_force_kernel(steer_axis, caster_offset, steer_angle, force):  # typ
             found[k] = pull / math.hypot(x, y)
             k += 1
     return found
+
+
+@compiled
+def output_kernel(B, steer_axis, caster_offset, steer_angle, force):  # type: ignore[no-untyped-def]
+    """Return `joint_torque_kernel` and `internal_force_kernel` of forces (n, 2), in one call."""
+    return joint_torque_kernel(B, force), internal_force_kernel(steer_axis, caster_offset, steer_angle, force)
 
 
 @compiled

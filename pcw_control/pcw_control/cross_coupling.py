@@ -12,14 +12,11 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
-
-from pcw_description.robot_description import FloatArray, RobotDescription
+from pcw_description.robot_description import RobotDescription
 
 from .controller_interface import parameter
 from .delay_margin import derived_bandwidth
 from .resolved_motion_rate import ResolvedMotionRate, ResolvedMotionRateParameters
-from .slip_constraint_force import internal_part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +43,3 @@ class CrossCoupling(ResolvedMotionRate):
         # Wheels that move against each other feel 1 + c times the gain; it too has to bear the delay.
         strongest = derived_bandwidth(robot, (1.0 + self.parameters.coupling) * self.bandwidth) / self.bandwidth
         self.coupling = max(strongest - 1.0, 0.0)
-        self._unit = np.tile(np.eye(2), (robot.n, 1, 1))
-
-    def _coupling(self, A: FloatArray, error: FloatArray, integral: FloatArray) -> FloatArray:
-        relative: FloatArray = self._k_p * internal_part(A, self._unit, error)
-        return self.coupling * (relative + self._k_i * internal_part(A, self._unit, integral))

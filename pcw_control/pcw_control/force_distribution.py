@@ -142,9 +142,18 @@ def weighted_forces(A: FloatArray, wrench: FloatArray, limit: FloatArray) -> Flo
         wrench: F (3,).
         limit: what each wheel holds, along and across (n, 2) [N].
     """
-    held = np.maximum(limit, LEAST_LIMIT)
-    forces: FloatArray = weighted_forces_kernel(A, wrench, (held * held).ravel())
+    forces: FloatArray = forces_by_limit_kernel(A, wrench, limit)
     return forces
+
+
+@compiled
+def forces_by_limit_kernel(A, wrench, limit):  # type: ignore[no-untyped-def]
+    """As `weighted_forces`; one call in a control cycle."""
+    weight = np.empty(2 * len(limit))
+    for i in range(len(limit)):
+        for j in range(2):
+            weight[2 * i + j] = max(limit[i, j], LEAST_LIMIT) ** 2
+    return weighted_forces_kernel(A, wrench, weight)
 
 
 def limited_forces(A: FloatArray, wrench: FloatArray, limit: FloatArray) -> SharedForces:

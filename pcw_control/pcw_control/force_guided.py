@@ -42,6 +42,7 @@ from .controller_interface import (
     ForceReference,
     Reference,
     choice,
+    output_kernel,
     parameter,
 )
 from .delay_margin import DELAY
@@ -198,15 +199,15 @@ class UnifiedForceMotion(ComputedTorque):
             before, reference_twist=followed,
             error_integral=state.error_integral, guided_twist=V_f, impulse=impulse, energy=energy,
         )  # fmt: skip
-        return state, dataclasses.replace(demand, wrench=F_u)
+        return state, demand._replace(wrench=F_u)
 
     def _output(self, state: ComputedTorqueState, demand: Demand, F_con: FloatArray) -> ForceGuidedOutput:
         guided: Any = state
-        plain = super()._output(state, demand, F_con)
+        tau, internal = output_kernel(self._B, *self._geometry, demand.steer_angle, F_con)
         return ForceGuidedOutput(
-            **vars(plain), guided_twist=guided.guided_twist, stored_energy=float(guided.energy[_STORED]),
-            guard=GUARDS[int(guided.energy[_GUARD])],
-        )
+            tau, F_con, demand.wrench, demand.twist, state.reference_twist, internal, guided.guided_twist,
+            float(guided.energy[_STORED]), GUARDS[int(guided.energy[_GUARD])],
+        )  # fmt: skip
 
 
 class ForceGuided(SlipConstraintForce, UnifiedForceMotion):

@@ -29,6 +29,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from pcw_description.augmented_object_model import augmented_object_kernel
 from pcw_description.compiled import compiled
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 
@@ -37,15 +38,15 @@ from .controller_interface import ControllerMeasurement, parameter
 from .force_distribution import (
     LEAST_LIMIT,
     basic_forces,
+    forces_by_limit_kernel,
     friction_optimal_forces,
     jacobian_forces,
     limited_forces_kernel,
     solve_kernel,
     weighted_forces,
-    weighted_forces_kernel,
 )
 from .friction_budget import GROUND_SHARE
-from .wheel_loads import WheelLoads
+from .wheel_loads import WheelLoads, traction_limit_kernel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,33 +108,67 @@ class _OnGround(ComputedTorque):
         self, V_d: FloatArray, V_dot_d: FloatArray, A: FloatArray, steer_angle: FloatArray, measurement: ControllerMeasurement
     ) -> float:
         """Return share / use where the wanted change needs more of the friction than the share, by the weighted forces."""
-        inertia, _ = self._model.evaluate(steer_angle, V_d)
-        limit = self._loads.traction_limit(steer_angle, V_dot_d, measurement.friction, measurement.normal_force)
-        use = _use_by_weights(A, inertia @ V_dot_d, limit)
+        use: float = _use_of_change(
+            *self._model.numbers[:2], *self._loads.numbers, A, steer_angle, V_d, V_dot_d,
+            *self._loads.known(measurement.friction, measurement.normal_force),
+        )  # fmt: skip
         return min(self.parameters.ground_share / max(use, 1e-12), 1.0)
 
     def _traction_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
         """Return mu F_z (n, 2) [N] at the acceleration that the demand asks for."""
-        acceleration: FloatArray = solve_kernel(demand.inertia, demand.wrench)
-        return self._loads.traction_limit(
-            demand.steer_angle, acceleration, measurement.friction, measurement.normal_force
-        )
+        limit: FloatArray = _limit_of_demand(
+            *self._loads.numbers, demand.steer_angle, demand.inertia, demand.wrench,
+            *self._loads.known(measurement.friction, measurement.normal_force),
+        )  # fmt: skip
+        return limit
+
+
+@compiled
+def _use_of_change(  # type: ignore[no-untyped-def]
+    chassis, modules, load_chassis, load_module, steer_axis, caster_offset, mu, A, steer_angle, V, V_dot, friction,
+    normal_force,
+):
+    """Return how much of the friction Lambda V_dot needs, by the weighted forces [1]."""
+    inertia, _ = augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_angle, V)
+    wrench = np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            wrench[i] += inertia[i, j] * V_dot[j]
+    limit = traction_limit_kernel(
+        load_chassis, load_module, steer_axis, caster_offset, mu, steer_angle, V_dot, friction, normal_force
+    )
+    return _use_by_weights(A, wrench, limit)
+
+
+@compiled
+def _limit_of_demand(  # type: ignore[no-untyped-def]
+    chassis, module, steer_axis, caster_offset, mu, steer_angle, inertia, wrench, friction, normal_force
+):
+    """Return mu F_z (n, 2) at the acceleration Lambda^-1 F."""
+    acceleration = solve_kernel(inertia, wrench)
+    return traction_limit_kernel(
+        chassis, module, steer_axis, caster_offset, mu, steer_angle, acceleration, friction, normal_force
+    )
 
 
 @compiled
 def _use_by_weights(A, wrench, limit):  # type: ignore[no-untyped-def]
     """Return the largest |F_i| / limit_i of the weighted forces, at most 11 % above the least there is; in every cycle."""
-    n = len(limit)
-    weight = np.empty(2 * n)
-    for i in range(n):
-        for j in range(2):
-            weight[2 * i + j] = max(limit[i, j], LEAST_LIMIT) ** 2
-    force = weighted_forces_kernel(A, wrench, weight)
+    force = forces_by_limit_kernel(A, wrench, limit)
     largest = 0.0
-    for i in range(n):
+    for i in range(len(limit)):
         along, across = force[i, 0] / max(limit[i, 0], LEAST_LIMIT), force[i, 1] / max(limit[i, 1], LEAST_LIMIT)
         largest = max(largest, math.hypot(along, across))
     return largest
+
+
+@compiled
+def _least_of(limit, bound, share):  # type: ignore[no-untyped-def]
+    least = np.empty(limit.shape)
+    for i in range(len(limit)):
+        for j in range(2):
+            least[i, j] = share * min(limit[i, j], bound[i, j])
+    return least
 
 
 class WeightedPseudoInverse(_OnGround):
@@ -174,8 +209,10 @@ class TractionLimitAvoidance(_OnGround):
 
     def force_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
         """Return a f_m (n, 2) [N]: a box within both the friction ellipse's axes and the torque limits."""
-        limit = np.minimum(self._traction_limit(demand, measurement), self._torque_bound)
-        return self.parameters.traction_share * limit
+        limit: FloatArray = _least_of(
+            self._traction_limit(demand, measurement), self._torque_bound, self.parameters.traction_share
+        )
+        return limit
 
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float

@@ -67,28 +67,33 @@ class ReferenceMotion:
     """The reference twist of one robot."""
 
     def __init__(self, robot: RobotDescription, parameters: MotionParameters) -> None:
-        self._limits, self._fraction = parameters.limits, parameters.joint_speed_fraction
-        self._B_inverse: FloatArray = np.linalg.inv(joint_matrix_blocks(robot)).astype(np.float64)
-        self._speed_limit = robot.speed_limit * parameters.joint_speed_fraction
-        self._offset = robot.caster_offset[:, 0].copy()
-        self._steer_acceleration = parameters.steer_acceleration or derived_steer_acceleration(robot)
+        limits = parameters.limits
+        B_inverse: FloatArray = np.linalg.inv(joint_matrix_blocks(robot)).astype(np.float64)
+        # What `towards_kernel` takes last.
+        self.numbers = (
+            B_inverse, robot.speed_limit * parameters.joint_speed_fraction, robot.caster_offset[:, 0].copy(),
+            np.array(
+                [
+                    parameters.joint_speed_fraction, parameters.steer_acceleration or derived_steer_acceleration(robot),
+                    limits.speed, limits.acceleration, limits.yaw_rate, limits.yaw_acceleration,
+                ]
+            ),
+        )  # fmt: skip
 
     def towards(
         self, reference_twist: FloatArray, target: FloatArray, A: FloatArray, dt: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return the next reference twist (3,) and its derivative (3,) on the way to a target (3,), with A (2n, 3)."""
-        limits = self._limits
-        V_d, V_dot_d = _towards(
-            reference_twist, target, A, self._B_inverse, self._speed_limit, self._offset, self._fraction,
-            self._steer_acceleration, dt, limits.speed, limits.acceleration, limits.yaw_rate, limits.yaw_acceleration,
-        )
+        V_d, V_dot_d = towards_kernel(reference_twist, target, A, dt, *self.numbers)
         return V_d, V_dot_d
 
 
 @compiled
-def _towards(  # type: ignore[no-untyped-def]
-    reference, target, A, B_inverse, speed_limit, offset, fraction, alpha, dt, speed, acceleration, yaw_rate, yaw_acceleration
-):
+def towards_kernel(reference, target, A, dt, B_inverse, speed_limit, offset, numbers):  # type: ignore[no-untyped-def]
+    """As `ReferenceMotion.towards`; one call in every control cycle."""
+    fraction, alpha, speed, acceleration, yaw_rate, yaw_acceleration = (
+        numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5],
+    )  # fmt: skip
     wanted = target * _shrink(target, speed, yaw_rate)
     wanted = wanted / max(1.0, largest_joint_speed_kernel(A, wanted, B_inverse, speed_limit))
     wanted = wanted / max(1.0, _hardest_turn(A, wanted, offset, alpha))

@@ -26,14 +26,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from pcw_description.differential_kinematics import (
-    forward_kinematics_kernel,
-    joint_matrix_blocks,
-    wheel_jacobian_kernel,
-)
-from pcw_description.robot_description import STEER, FloatArray, RobotDescription
+from pcw_description.compiled import compiled
+from pcw_description.differential_kinematics import joint_matrix_blocks
+from pcw_description.robot_description import FloatArray, RobotDescription
 
 from . import sliding_mode
+from .computed_torque import kinematics_kernel
 from .controller_interface import (
     ControllerMeasurement,
     ControllerOutput,
@@ -42,13 +40,13 @@ from .controller_interface import (
     TwistReference,
     check_step,
     choice,
-    internal_force_kernel,
-    joint_torque_kernel,
+    output_kernel,
     parameter,
 )
 from .delay_margin import BANDWIDTH, derived_bandwidth, effective_mass, own_mass, tyre_resonance
 from .errors import ControlError
 from .reference_motion import MotionParameters, ReferenceMotion
+from .slip_constraint_force import internal_part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +128,9 @@ class ResolvedMotionRate:
         self._geometry = (robot.steer_axis, robot.caster_offset)
         self._radius = robot.wheel_radius
         self._B = joint_matrix_blocks(robot)
-        self._B_transposed = np.ascontiguousarray(self._B.transpose(0, 2, 1))
+        # How much stronger the difference between wheels is controlled; see `cross_coupling`.
+        self.coupling = 0.0
+        self._unit = np.tile(np.eye(2), (robot.n, 1, 1))
         self._reference_motion = ReferenceMotion(robot, self.parameters)
         self._mass = effective_mass(robot)
         w = self.bandwidth = self.parameters.bandwidth or derived_bandwidth(robot, BANDWIDTH)
@@ -162,26 +162,23 @@ class ResolvedMotionRate:
             ControlError: dt is not positive, or a measurement or the reference is not finite; the state stays as it was.
         """
         check_step(measurement, reference, dt, self._n)
-        steer_angle = np.ascontiguousarray(measurement.joint_position[:, STEER])
-        joint_velocity = np.ascontiguousarray(measurement.joint_velocity)
-        A = wheel_jacobian_kernel(*self._geometry, steer_angle)
-        V, incompatibility, _ = forward_kinematics_kernel(*self._geometry, self._radius, steer_angle, joint_velocity)
+        joint_velocity = np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64)
+        steer_angle, A, V, _, _ = kinematics_kernel(
+            *self._geometry, self._radius, np.ascontiguousarray(measurement.joint_position, dtype=np.float64), joint_velocity
+        )
         V_d, wanted = self._wanted(state, measurement, reference, A, dt)
-        # B q_dot is B^T of the transposed blocks.
-        moved = joint_torque_kernel(self._B_transposed, joint_velocity)
+        share, slip = 0.0, joint_velocity
         if self.parameters.slip_share > 0.0 and measurement.slip is not None:
-            slip = measurement.slip if measurement.slip_valid is None else measurement.slip * measurement.slip_valid
-            moved = moved - self.parameters.slip_share * slip
-        e = (A @ wanted).reshape(self._n, 2) - moved
-        integral = state.error_integral
-        if not measurement.saturated:
-            integral = np.clip(integral + e * dt, -self._largest_integral, self._largest_integral)
-        u_c = self._k_p * e + self._k_i * integral + self._coupling(A, e, integral)
+            share, slip = self.parameters.slip_share, measurement.slip
+            slip = np.ascontiguousarray(slip if measurement.slip_valid is None else slip * measurement.slip_valid)
+        e, integral, u_c = _continuous(
+            A, wanted, self._B, joint_velocity, share, slip, state.error_integral, measurement.saturated,
+            self._largest_integral, self._k_p, self._k_i, self.coupling, self._unit, dt,
+        )  # fmt: skip
         sliding, u = self._discontinuous(state.sliding, e, u_c, measurement.saturated, dt)
-        tau = joint_torque_kernel(self._B, u)
-        internal = internal_force_kernel(*self._geometry, steer_angle, u)
+        tau, internal, wrench = _forces(self._B, *self._geometry, steer_angle, A, u)
         state = ResolvedMotionRateState(V_d, integral, sliding)
-        return state, ControllerOutput(tau, u, A.T @ u.ravel(), V, V_d, internal)
+        return state, ControllerOutput(tau, u, wrench, V, V_d, internal)
 
     def _wanted(
         self, state: ResolvedMotionRateState, measurement: ControllerMeasurement, reference: Reference, A: FloatArray,
@@ -202,15 +199,42 @@ class ResolvedMotionRate:
         V_d = R_T @ reference.velocity
         return V_d, V_d + self.parameters.pose_bandwidth * (R_T @ e)
 
-    def _coupling(self, A: FloatArray, error: FloatArray, integral: FloatArray) -> FloatArray | float:
-        """Return forces (n, 2) that depend on the errors of other wheels; none here."""
-        return 0.0
-
     def _discontinuous(
         self, state: sliding_mode.SlidingModeState, error: FloatArray, u_c: FloatArray, saturated: bool, dt: float
     ) -> tuple[sliding_mode.SlidingModeState, FloatArray]:
         """Return the state of the sliding mode and u; RMRC has none."""
         return state, u_c
+
+
+@compiled
+def _continuous(  # type: ignore[no-untyped-def]
+    A, wanted, B, joint_velocity, slip_share, slip, integral, hold, largest, k_p, k_i, coupling, unit, dt
+):
+    """Return e (5.1), its integral and u_c, each (n, 2), with the coupling c of `cross_coupling`."""
+    n = len(B)
+    e, grown, u = np.empty((n, 2)), integral.copy(), np.empty((n, 2))
+    for i in range(n):
+        for j in range(2):
+            k = 2 * i + j
+            moved = B[i, j, 0] * joint_velocity[i, 0] + B[i, j, 1] * joint_velocity[i, 1] - slip_share * slip[i, j]
+            e[i, j] = A[k, 0] * wanted[0] + A[k, 1] * wanted[1] + A[k, 2] * wanted[2] - moved
+            if not hold:
+                grown[i, j] = min(max(integral[i, j] + dt * e[i, j], -largest[i, j]), largest[i, j])
+            u[i, j] = k_p[i, j] * e[i, j] + k_i[i, j] * grown[i, j]
+    if coupling > 0.0:
+        u += coupling * (k_p * internal_part(A, unit, e) + k_i * internal_part(A, unit, grown))
+    return e, grown, u
+
+
+@compiled
+def _forces(B, steer_axis, caster_offset, steer_angle, A, u):  # type: ignore[no-untyped-def]
+    """Return torques (n, 2), internal forces and the wrench A^T u (3,) of forces u (n, 2)."""
+    torque, internal = output_kernel(B, steer_axis, caster_offset, steer_angle, u)
+    wrench = np.zeros(3)
+    for k in range(len(A)):
+        for i in range(3):
+            wrench[i] += A[k, i] * u[k // 2, k % 2]
+    return torque, internal, wrench
 
 
 class SlidingModeRate(ResolvedMotionRate):

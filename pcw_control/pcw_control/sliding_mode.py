@@ -25,6 +25,7 @@ import math
 
 import numpy as np
 
+from pcw_description.compiled import compiled
 from pcw_description.robot_description import FloatArray
 
 from .errors import ControlError
@@ -96,18 +97,35 @@ def step(
         return dataclasses.replace(state, filtered=u_dis, sliding=error), continuous + u_dis
     if law != "low_pass_integral":
         raise ControlError(f"sliding law {law!r} is not allowed; allowed: {', '.join(SLIDING_LAWS)}")
-    if state.auxiliary is None or saturated:
-        # Begin where s says what is known of the disturbance already.
-        filtered = switched = state.filtered
-        s = filtered * np.maximum(settling, dt) / mass
-        z = s - error
-    else:
-        z = state.auxiliary + dt / mass * (state.force - state.switched)
-        bound = gain * np.maximum(settling, dt) / mass
-        # What D is more than K cannot be made up for and is not stored: s waits at its bound instead of winding up.
-        s = np.clip(error + z, -bound, bound)
-        z = s - error
-        switched = s * mass / np.maximum(settling, dt)
-        filtered = state.filtered + (1.0 - math.exp(-dt / filter_time)) * (switched - state.filtered)
-    u = continuous + filtered
+    begins = state.auxiliary is None or saturated
+    z, filtered, switched, u, s = _low_pass_integral(
+        begins, state.filtered if state.auxiliary is None else state.auxiliary, state.filtered, state.switched, state.force,
+        error, continuous, mass, gain, filter_time, settling, dt,
+    )  # fmt: skip
     return SlidingModeState(z, filtered, switched, u, s), u
+
+
+@compiled
+def _low_pass_integral(  # type: ignore[no-untyped-def]
+    begins, auxiliary, filtered_before, switched_before, force, error, continuous, mass, gain, filter_time, settling, dt
+):
+    """Return z, u_dis, K sgn(s), u and s, each (n, 2)."""
+    z, filtered, switched = np.empty(error.shape), filtered_before.copy(), filtered_before.copy()
+    u, s = np.empty(error.shape), np.empty(error.shape)
+    passed = 1.0 - math.exp(-dt / filter_time)
+    for i in range(len(error)):
+        for j in range(2):
+            stiffness = mass[i, j] / max(settling[i, j], dt)
+            if begins:
+                # Begin where s says what is known of the disturbance already.
+                s[i, j] = filtered[i, j] / stiffness
+            else:
+                reached = error[i, j] + auxiliary[i, j] + dt / mass[i, j] * (force[i, j] - switched_before[i, j])
+                bound = gain[i, j] / stiffness
+                # What D is more than K cannot be made up for and is not stored: s waits at its bound instead of winding up.
+                s[i, j] = min(max(reached, -bound), bound)
+                switched[i, j] = s[i, j] * stiffness
+                filtered[i, j] += passed * (switched[i, j] - filtered[i, j])
+            z[i, j] = s[i, j] - error[i, j]
+            u[i, j] = continuous[i, j] + filtered[i, j]
+    return z, filtered, switched, u, s

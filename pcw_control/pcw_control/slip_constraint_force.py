@@ -154,6 +154,15 @@ class SlipConstraintLaw:
         )
         return integral, InternalSlipForce(force, slip)
 
+    def added(
+        self, state: FloatArray, A: FloatArray, joint_velocity: FloatArray, saturated: bool, dt: float, force: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """As `step`, of which it returns the state, and the internal force added to contact forces (n, 2) [N]."""
+        integral, total = _added(
+            A, self._B, self.gain, self._largest, self._numbers, state, joint_velocity, saturated, dt, force
+        )
+        return integral, total
+
 
 @compiled
 def internal_part(A, K, w):  # type: ignore[no-untyped-def]
@@ -208,6 +217,12 @@ def _slip_force(A, B, K, largest, numbers, integral, joint_velocity, saturated, 
     return grown, force, slip
 
 
+@compiled
+def _added(A, B, K, largest, numbers, integral, joint_velocity, saturated, dt, force):  # type: ignore[no-untyped-def]
+    grown, internal, _ = _slip_force(A, B, K, largest, numbers, integral, joint_velocity, saturated, dt)
+    return grown, force + internal
+
+
 @dataclasses.dataclass(frozen=True)
 class SlipConstraintForceParameters(ComputedTorqueParameters):
     """Those of computed torque, and how slip is held.
@@ -252,10 +267,9 @@ class SlipConstraintForce(ComputedTorque):
         """Return the contact forces (n, 2) of the distribution below and the internal ones that hold slip."""
         state, F_con = super()._distribute(state, demand, measurement, dt)
         held: Any = state
-        integral, internal = self.law.step(
-            held.slip_integral, demand.A, np.ascontiguousarray(measurement.joint_velocity), measurement.saturated, dt
-        )
-        return dataclasses.replace(held, slip_integral=integral), F_con + internal.force
+        velocity = np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64)
+        integral, F_con = self.law.added(held.slip_integral, demand.A, velocity, measurement.saturated, dt, F_con)
+        return dataclasses.replace(held, slip_integral=integral), F_con
 
 
 @dataclasses.dataclass(frozen=True)

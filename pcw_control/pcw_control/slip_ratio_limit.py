@@ -21,7 +21,7 @@ import numpy as np
 
 from pcw_description.compiled import compiled
 from pcw_description.differential_kinematics import joint_matrix_blocks
-from pcw_description.robot_description import DRIVE, FloatArray, RobotDescription
+from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 
 from .computed_torque import ComputedTorqueState
 from .controller_interface import (
@@ -90,6 +90,7 @@ class SlipRatioLimit(SlipConstraintForce):
             [control.gain, control.sliding_gain, control.layer, control.filter_time, control.least_speed]
         )
         self._critical = np.array([tyre.lambda_p for tyre in robot.tyres])
+        self._vouched = np.ones((robot.n, 2), dtype=bool)
         self._to_torque = joint_matrix_blocks(robot)
         self._to_force = np.linalg.inv(self._to_torque)
 
@@ -105,37 +106,40 @@ class SlipRatioLimit(SlipConstraintForce):
         before: Any = state
         if measurement.slip is None:
             return dataclasses.replace(before, ratio=np.zeros((self._n, 4))), output
-        known = np.isfinite(measurement.slip[:, 0])
-        if measurement.slip_valid is not None:
-            known = known & measurement.slip_valid[:, 0]
-        critical = self._critical if measurement.critical_slip is None else measurement.critical_slip
-        band = np.maximum(self.parameters.ratio.share * critical, self.parameters.ratio.least)
-        ratio, drive = _kept_in_band(
-            self._wheels, self._ratio_numbers, before.ratio, self._to_torque,
-            np.ascontiguousarray(measurement.joint_velocity), np.ascontiguousarray(measurement.slip), known, band,
-            np.ascontiguousarray(output.torque[:, DRIVE]), dt,
+        p = self.parameters.ratio
+        ratio, torque, force, internal, changed = _kept_in_band(
+            self._wheels, self._ratio_numbers, before.ratio, self._to_torque, self._to_force, *self._geometry,
+            np.ascontiguousarray(measurement.joint_position, dtype=np.float64),
+            np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64),
+            np.ascontiguousarray(measurement.slip, dtype=np.float64),
+            self._vouched if measurement.slip_valid is None else np.ascontiguousarray(measurement.slip_valid, dtype=bool),
+            self._critical if measurement.critical_slip is None else measurement.critical_slip, p.share, p.least,
+            output.torque, dt,
         )  # fmt: skip
         state = dataclasses.replace(before, ratio=ratio)
-        if np.array_equal(drive, output.torque[:, DRIVE]):
+        if not changed:
             return state, output
-        torque = output.torque.copy()
-        torque[:, DRIVE] = drive
-        # tau = B^T F once more, so that what is said of forces is true.
-        force = joint_torque_kernel(self._to_force, torque)
-        steer_angle = np.ascontiguousarray(measurement.joint_position[:, 1])
-        internal = internal_force_kernel(*self._geometry, steer_angle, force)
         return state, dataclasses.replace(output, torque=torque, contact_force=force, internal_force=internal)
 
 
 @compiled
-def _kept_in_band(wheels, numbers, before, B, joint_velocity, slip, known, band, wanted, dt):  # type: ignore[no-untyped-def]
-    """Return the sliding modes (n, 4) and the drive torques (n,) within their bounds."""
+def _kept_in_band(  # type: ignore[no-untyped-def]
+    wheels, numbers, before, B, to_force, steer_axis, caster_offset, joint_position, joint_velocity, slip, vouched, critical,
+    share, least, wanted, dt,
+):
+    """Return the sliding modes (n, 4), torques and forces (n, 2) and internal forces, and whether any torque has changed.
+
+    The drive torques lie within their bounds; forces are those that make the torques, so that what is said of them is true.
+    """
     gain, sliding, layer, filter_time, least_speed = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     n = len(wheels)
-    after, torque = np.zeros((n, 4)), wanted.copy()
+    after, torque, changed = np.zeros((n, 4)), wanted.copy(), False
+    steer_angle = np.empty(n)
     for i in range(n):
-        if not known[i]:
+        steer_angle[i] = joint_position[i, STEER]
+        if not vouched[i, 0]:
             continue  # and what the sliding mode had found is forgotten
+        band = max(share * critical[i], least)
         inertia, radius, mass, limit = wheels[i, 0], wheels[i, 1], wheels[i, 2], wheels[i, 3]
         # With a lateral offset the turning fork rolls the wheel centre along as well.
         sensed = B[i, 0, 0] * joint_velocity[i, 0] + B[i, 0, 1] * joint_velocity[i, 1]
@@ -148,9 +152,11 @@ def _kept_in_band(wheels, numbers, before, B, joint_velocity, slip, known, band,
         w = K * min(max((ratio - predicted) / (layer * K * g * dt), -1.0), 1.0)
         average = before[i, 2] + (w - before[i, 2]) * dt / (filter_time + dt)
         if before[i, 0] > 0.0:
-            high = max((gain * (band[i] - ratio) - f) / g - average, -limit)
-            low = min((gain * (-band[i] - ratio) - f) / g - average, limit)
-            torque[i] = min(max(wanted[i], low), high)
-        held = min(max(torque[i], -limit), limit)
+            high = max((gain * (band - ratio) - f) / g - average, -limit)
+            low = min((gain * (-band - ratio) - f) / g - average, limit)
+            torque[i, DRIVE] = min(max(wanted[i, DRIVE], low), high)
+            changed = changed or torque[i, DRIVE] != wanted[i, DRIVE]
+        held = min(max(torque[i, DRIVE], -limit), limit)
         after[i, 0], after[i, 1], after[i, 2], after[i, 3] = 1.0, predicted, average, f + g * (held + w)
-    return after, torque
+    force = joint_torque_kernel(to_force, torque)
+    return after, torque, force, internal_force_kernel(steer_axis, caster_offset, steer_angle, force), changed

@@ -22,8 +22,11 @@ class WheelLoads:
         self._chassis = np.array([chassis.mass, *chassis.com])
         self._module = np.array([[c.module.mass, *c.module.com, c.wheel_radius] for c in modules])
         self._geometry = (robot.steer_axis, robot.caster_offset)
-        self._mu = np.array([[tyre.mu_p, tyre.lateral.mu_p] for tyre in robot.tyres])
-        self._mu_along = np.ascontiguousarray(self._mu[:, 0])
+        mu = np.array([[tyre.mu_p, tyre.lateral.mu_p] for tyre in robot.tyres])
+        # Peak friction along and across (n, 2), and along (n,), of the robot's ground.
+        self.mu, self.mu_along = mu, np.ascontiguousarray(mu[:, 0])
+        # What `traction_limit_kernel` takes first.
+        self.numbers = (self._chassis, self._module, *self._geometry, mu)
 
     def normal_force(self, steer_angle: FloatArray, acceleration: FloatArray) -> FloatArray:
         """Return F_z (n,) [N].
@@ -50,18 +53,33 @@ class WheelLoads:
             friction: peak friction coefficient under each wheel (n,); None is that of the robot's ground.
             normal_force: measured loads (n,) [N]; None computes them.
         """
-        load = self.normal_force(steer_angle, acceleration) if normal_force is None else normal_force
-        limit: FloatArray = _limits(self._mu, self._mu_along if friction is None else friction, load)
+        limit: FloatArray = traction_limit_kernel(
+            *self.numbers, steer_angle, acceleration, *self.known(friction, normal_force)
+        )
         return limit
+
+    def known(self, friction: FloatArray | None, normal_force: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Return friction (n,) and loads as `traction_limit_kernel` takes them last: loads (0,) that nobody measured."""
+        return self.mu_along if friction is None else friction, _NO_LOADS if normal_force is None else normal_force
+
+
+_NO_LOADS = np.zeros(0)
 
 
 @compiled
-def _limits(mu, friction, load):  # type: ignore[no-untyped-def]
+def traction_limit_kernel(  # type: ignore[no-untyped-def]
+    chassis, module, steer_axis, caster_offset, mu, steer_angle, acceleration, friction, normal_force
+):
     """Return mu F_z (n, 2); an estimate of friction is of the ground: along and across keep the ratio that the tyre has."""
+    measured = len(normal_force) > 0
+    load = np.empty(len(steer_angle))
+    if not measured:
+        load = _loads(chassis, module, steer_axis, caster_offset, steer_angle, acceleration)
     limit = np.empty(mu.shape)
     for i in range(len(load)):
+        carried = normal_force[i] if measured else load[i]
         for j in range(2):
-            limit[i, j] = mu[i, j] * (friction[i] / mu[i, 0]) * load[i]
+            limit[i, j] = mu[i, j] * (friction[i] / mu[i, 0]) * carried
     return limit
 
 

@@ -15,10 +15,16 @@ from pcw_control import (
     TwistReference,
     make_controller,
 )
-from pcw_control.controller_interface import ControllerParameters, settable_fields, with_values
+from pcw_control.controller_interface import (
+    ControllerParameters,
+    internal_forces,
+    settable_fields,
+    with_values,
+)
 from pcw_control.delay_margin import DELAY, delay_margin, effective_mass
 from pcw_control.slip_ratio_limit import SlipRatioLimitParameters
-from pcw_description import load_robot
+from pcw_description import inverse_kinematics, load_robot
+from pcw_description.differential_kinematics import joint_matrix_blocks
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 
@@ -38,6 +44,56 @@ def test_every_controller_is_made_by_name_and_steps(name):
     assert output.torque.shape == output.contact_force.shape == (4, 2)
     assert output.internal_force.shape == (6,) and np.isfinite(output.torque).all()
     assert entry.parameters.uses <= {"slip", "friction", "external_wrench"}
+
+
+@pytest.mark.parametrize("name", sorted(CONTROLLERS))
+def test_what_a_controller_says_of_forces_is_what_its_torques_are(name):
+    """tau = B^T F_con, and the internal forces are those of F_con; also where slip ratios are held, whose torques are changed
+    after the forces were shared.
+    """
+    robot, rng = load_robot("thesis"), np.random.default_rng(3)
+    controller = make_controller(name, robot)
+    state, output = controller.initial_state(np.array([0.5, 0.0, 0.0])), None
+    angle = rng.uniform(-0.3, 0.3, 4)
+    rates = inverse_kinematics(robot, angle, np.array([0.5, 0.0, 0.0]))
+    slip = np.column_stack([np.full(4, 0.15), np.zeros(4)])
+    measurement = ControllerMeasurement(
+        np.column_stack([np.zeros(4), angle]), rates, np.zeros(3), slip=slip, friction=np.full(4, 0.5),
+        external_wrench=np.array([20.0, 5.0, 1.0]),
+    )  # fmt: skip
+    for _ in range(40):
+        state, output = controller.step(state, measurement, TwistReference(np.array([1.0, 0.0, 0.0])), 0.002)
+    force = output.contact_force
+    torque = np.einsum("nji,nj->ni", joint_matrix_blocks(robot), force)
+    np.testing.assert_allclose(output.torque, torque, atol=1e-9)
+    internal = internal_forces(robot.steer_axis, robot.caster_offset, angle, force)
+    np.testing.assert_allclose(output.internal_force, internal, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(CONTROLLERS))
+def test_arrays_need_not_lie_as_compiled_code_likes_them(name):
+    """Columns of a larger table, and whole numbers: the torques are those of tidy copies."""
+    robot, rng = load_robot("thesis"), np.random.default_rng(4)
+    controller = make_controller(name, robot)
+    table = rng.integers(-2, 3, (4, 8))
+    tidy = [np.ascontiguousarray(table[:, k : k + 2], dtype=float) for k in (0, 2, 4)]
+    outputs = []
+    for position, velocity, slip in ([table[:, 0:2], table[:, 2:4], table[:, 4:6]], tidy):
+        measurement = ControllerMeasurement(position, velocity, np.zeros(3), slip=slip, friction=np.full(4, 0.5))
+        reference = TwistReference(np.array([0.2, 0.0, 0.1]))
+        outputs.append(controller.step(controller.initial_state(), measurement, reference, 0.002)[1].torque)
+    np.testing.assert_array_equal(*outputs)
+
+
+@pytest.mark.parametrize("field", ["slip", "friction", "critical_slip", "normal_force", "external_wrench"])
+def test_what_is_optional_is_refused_by_name_where_it_is_no_number_or_of_another_shape(field):
+    robot = load_robot("thesis")
+    controller, zero = make_controller("computed_torque", robot), np.zeros((4, 2))
+    shape = {"slip": (4, 2), "external_wrench": (3,)}.get(field, (4,))
+    for bad in (np.full(shape, np.nan), np.zeros((5, 2)), np.zeros((1, *shape))):
+        measurement = ControllerMeasurement(zero, zero, np.zeros(3), **{field: bad})
+        with pytest.raises(ControlError, match=field):
+            controller.step(controller.initial_state(), measurement, TwistReference(np.zeros(3)), 0.002)
 
 
 def test_every_number_of_every_controller_has_unit_meaning_and_range():

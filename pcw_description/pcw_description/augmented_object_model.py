@@ -133,7 +133,8 @@ class AugmentedObjectModel:
     def __init__(self, robot: RobotDescription) -> None:
         robot.require_torque_control()
         chassis, modules = dynamic_parameters(robot)
-        self._numbers: tuple[FloatArray, FloatArray, FloatArray, FloatArray] = (
+        # What `augmented_object_kernel` takes first, for those that call it from compiled code.
+        self.numbers: tuple[FloatArray, FloatArray, FloatArray, FloatArray] = (
             chassis,
             modules,
             robot.steer_axis,
@@ -150,5 +151,5 @@ class AugmentedObjectModel:
         Returns:
             Lambda (3, 3), symmetric positive definite [kg, kg m, kg m^2], and theta (3,) [N, N, N m], in base_link.
         """
-        inertia, bias = augmented_object_kernel(*self._numbers, steer_angle, twist)
+        inertia, bias = augmented_object_kernel(*self.numbers, steer_angle, twist)
         return inertia, bias
