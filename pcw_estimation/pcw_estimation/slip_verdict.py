@@ -33,6 +33,8 @@ REASONS = {
     Verdict.SLIP: "some wheels slip",
     Verdict.CANNOT_KNOW: "all wheels slip, or one does not and cannot be told",
 }
+# Whatever the verdict: slip that is a motion of the whole robot is motion to every encoder.
+COMMON_SLIP = "whether all wheels slip alike cannot be known from encoders"
 
 
 @dataclasses.dataclass(frozen=True)

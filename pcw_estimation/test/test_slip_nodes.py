@@ -19,6 +19,7 @@ from pcw_estimation import SlipNoise  # noqa: E402
 
 THESIS = load_robot("thesis")
 NAMES = list(THESIS.joint_names)
+ALONE = "no slip of one wheel against another; whether all wheels slip alike cannot be known from encoders"
 
 
 @pytest.fixture
@@ -106,6 +107,19 @@ def test_a_missing_joint_is_said_and_not_made_up(ros):
     assert not slip
 
 
+def test_that_nothing_slips_is_said_only_by_who_has_an_imu(ros):
+    """Slip of all wheels alike is motion to every encoder: who has encoders alone cannot know, and once said "no slip"."""
+    ros.start("pcw_estimation.nodes.encoder_slip")
+    ros.start("pcw_estimation.nodes.imu_slip")
+    diagnostics, robot = ros.listen(DiagnosticArray, "/diagnostics"), Robot(ros)
+
+    def messages():
+        return [statuses(diagnostics)[f"{node}: slip"].message for node in ("encoder_slip", "imu_slip")]
+
+    both = {"encoder_slip: slip", "imu_slip: slip"}
+    robot.run(lambda: both <= set(statuses(diagnostics)) and messages() == [ALONE, "no slip"])
+
+
 def test_method_and_learned_noise_are_parameters(ros, tmp_path):
     SlipNoise.of_robot(THESIS).save(tmp_path / "noise.yaml", "thesis")
     ros.start(
@@ -113,7 +127,7 @@ def test_method_and_learned_noise_are_parameters(ros, tmp_path):
         "-r", "__node:=other",
     )
     diagnostics, robot = ros.listen(DiagnosticArray, "/diagnostics"), Robot(ros, with_imu=False)
-    robot.run(lambda: "other: slip" in statuses(diagnostics) and statuses(diagnostics)["other: slip"].message == "no slip")
+    robot.run(lambda: "other: slip" in statuses(diagnostics) and statuses(diagnostics)["other: slip"].message == ALONE)
     assert {v.key: v.value for v in statuses(diagnostics)["other: slip"].values}["method"] == "procedure"
     (tmp_path / "bad.yaml").write_text("format: pcw_slip_noise/1\nrobot: tidybot2\n")
     bad = ros.start("pcw_estimation.nodes.encoder_slip", "-p", f"noise:={tmp_path / 'bad.yaml'}")

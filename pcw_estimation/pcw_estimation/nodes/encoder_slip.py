@@ -127,7 +127,7 @@ class EncoderSlipNode(Node):
     def _status(self) -> Status:
         silent = "joint_states" if self._silence.since_last_report() else ""
         values = stamp_values(self._watch, self._unusable) | {"method": self._method}
-        return self._topic.status(values, self._problems.take(), silent)
+        return self._topic.status(values, self._problems.take(), silent, encoders_alone=True)
 
     def _joints(self) -> Mapping[str, Status]:
         """One status for each joint at fault; for all together where none is."""

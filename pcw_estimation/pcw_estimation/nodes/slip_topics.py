@@ -12,7 +12,7 @@ from pcw_description.nodes.node_tools import SENSOR_SOURCE, StampWatch, declare,
 from pcw_description.robot_description import RobotDescription
 
 from ..slip_noise import SlipNoise, load_slip_noise
-from ..slip_verdict import REASONS, SlipFinding, Verdict
+from ..slip_verdict import COMMON_SLIP, REASONS, SlipFinding, Verdict
 
 _DIRECTIONS = ("longitudinal", "lateral")
 # x, y and yaw among the rows of a 6x6 covariance; the others are zero because the model is planar, not measured.
@@ -59,13 +59,14 @@ class SlipTopic:
         fill_joint_state(self._message, position=finding.ratio, velocity=finding.slip)
         self._publisher.publish(self._message)
 
-    def status(self, values: dict[str, object], problems: str, silent: str) -> Status:
+    def status(self, values: dict[str, object], problems: str, silent: str, encoders_alone: bool) -> Status:
         """Return the status since the last report.
 
         Args:
             values: numbers to report as well.
             problems: what else went wrong, in words.
             silent: which topic went silent; "" for none.
+            encoders_alone: no other sensor was asked, so that slip of all wheels alike cannot be excluded.
         """
         flagged = [name for name, is_flagged in zip(self.names, self._ever.ravel()) if is_flagged]
         finding, unknown = self._finding, self._unknown
@@ -85,7 +86,8 @@ class SlipTopic:
             return Status(WARN, problems, values)
         if silent:
             return Status(WARN, f"no {silent} since the last report", values)
-        return Status(OK, "no slip", values)
+        # That nothing slips is more than encoders can say.
+        return Status(OK, f"no slip of one wheel against another; {COMMON_SLIP}" if encoders_alone else "no slip", values)
 
 
 def stamp_values(watch: StampWatch, unusable: int) -> dict[str, object]:
