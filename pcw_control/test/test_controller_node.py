@@ -478,3 +478,52 @@ def test_a_torque_that_is_no_number_lets_go_and_an_exception_latches(ros):
     assert change_state(ros, Transition.TRANSITION_ACTIVATE)
     robot.run(robot.drives)
     assert all(np.isfinite(command.effort).all() for command in robot.commands)
+
+
+# Kernels count what they have been compiled for; nothing may be added once the robot drives.
+_AFTER_THE_WARM_UP = """
+import sys
+
+import numpy as np
+import rclpy
+
+from pcw_control import CONTROLLERS, ControllerMeasurement, TrajectoryPoint, TwistReference, make_controller
+from pcw_control.nodes.controller import ControllerNode
+from pcw_control.quintic_trajectory import MotionLimits, plan_point_to_point
+
+
+def compiled():
+    kernels = {}
+    for name, module in list(sys.modules.items()):
+        if name.startswith("pcw_"):
+            kernels |= {f"{name}.{key}": len(k.signatures) for key, k in vars(module).items() if hasattr(k, "signatures")}
+    return kernels
+
+
+rclpy.init()
+node = ControllerNode()
+node._warm_up()
+before = compiled()
+assert len(before) > 20, before
+rng = np.random.default_rng(0)
+goal = plan_point_to_point(TrajectoryPoint(np.zeros(3)), TrajectoryPoint(np.ones(3)), MotionLimits(1.0, 0.5, 2.0, 1.0))
+for name in CONTROLLERS:
+    controller = make_controller(name, node.robot)
+    state = controller.initial_state()
+    for reference in (TwistReference(np.array([0.3, 0.0, 0.1])), goal.sample(0.5), goal.sample(1e3)):
+        for heard in ({}, {"slip": rng.normal(size=(4, 2)), "friction": np.full(4, 0.5), "critical_slip": np.full(4, 0.1)}):
+            measured = ControllerMeasurement(rng.normal(size=(4, 2)), rng.normal(size=(4, 2)), np.zeros(3), **heard)
+            state, _ = controller.step(state, measured, reference, 0.002)
+late = {key: count for key, count in compiled().items() if count != before.get(key, 0)}
+node.destroy_node()
+rclpy.try_shutdown()
+assert not late, late
+"""
+
+
+def test_nothing_is_left_to_compile_once_the_robot_drives(ros):
+    """To compile takes a second, in which a robot that drives has no answer: a goal must not be the first of its kind."""
+    pytest.importorskip("numba")
+    command = [sys.executable, "-c", _AFTER_THE_WARM_UP]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    assert found.returncode == 0, found.stderr[-2000:]

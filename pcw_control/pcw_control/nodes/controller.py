@@ -172,6 +172,7 @@ class ControllerNode(RobustLifecycleNode):
             controller = make_controller(name, self.robot, controller_parameters(self, name))
             motion = TwistReference(np.zeros(3))
             reference = ForceReference(np.zeros(3), motion) if "external_wrench" in entry.parameters.uses else motion
+            controller.step(controller.initial_state(), measurement, TrajectoryPoint(np.zeros(3)), 0.01)  # what a goal needs
             _, output = controller.step(controller.initial_state(), measurement, reference, 0.01)
             self._gate.pass_torque(self._gate.initial_state(), output.torque, at_rest, 0.01, frozenset())
 
