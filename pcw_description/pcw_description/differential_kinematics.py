@@ -47,44 +47,56 @@ def wheel_jacobian_kernel(steer_axis, caster_offset, steer_angle):  # type: igno
 
 
 @compiled
-def rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
-    """Return A^+ w (3,), what of w contradicts it (n, 2) and (A^T A)^-1 (3, 3), of velocities w (n, 2) in the wheel frames.
+def registration_kernel(steer_axis, caster_offset, direction, sensed, twist, slip):  # type: ignore[no-untyped-def]
+    """Fill twist (3,) and slip (n, 2), see `rigid_motion_kernel`; return the mean wheel centre and the spread about it.
+
+    Args:
+        direction: cosines and sines of the headings (n, 2).
+        sensed: velocities in the wheel frames (n, 2).
 
     The wheel centres move like a rigid body in the plane, so the least-squares twist is the one of a planar
     registration: rotation from the moments about the centroid, translation from the means.
     """
-    n = len(steer_angle)
-    wheel = np.empty((n, 6))  # of each its centre, cosine and sine of its heading, and its velocity along base_link's axes
+    n = len(direction)
     mean_px, mean_py, mean_wx, mean_wy = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
-        c, s = math.cos(steer_angle[i]), math.sin(steer_angle[i])
+        c, s = direction[i, 0], direction[i, 1]
         bx, by = caster_offset[i, 0], caster_offset[i, 1]
-        wheel[i, 0] = steer_axis[i, 0] + bx * c - by * s
-        wheel[i, 1] = steer_axis[i, 1] + bx * s + by * c
-        wheel[i, 2], wheel[i, 3] = c, s
-        wheel[i, 4] = c * sensed[i, 0] - s * sensed[i, 1]
-        wheel[i, 5] = s * sensed[i, 0] + c * sensed[i, 1]
-        mean_px += wheel[i, 0] / n
-        mean_py += wheel[i, 1] / n
-        mean_wx += wheel[i, 4] / n
-        mean_wy += wheel[i, 5] / n
+        mean_px += (steer_axis[i, 0] + bx * c - by * s) / n
+        mean_py += (steer_axis[i, 1] + bx * s + by * c) / n
+        mean_wx += (c * sensed[i, 0] - s * sensed[i, 1]) / n
+        mean_wy += (s * sensed[i, 0] + c * sensed[i, 1]) / n
     moment, spread = 0.0, 0.0
     for i in range(n):
-        px, py = wheel[i, 0] - mean_px, wheel[i, 1] - mean_py
-        moment += px * wheel[i, 5] - py * wheel[i, 4]
+        c, s = direction[i, 0], direction[i, 1]
+        bx, by = caster_offset[i, 0], caster_offset[i, 1]
+        px = steer_axis[i, 0] + bx * c - by * s - mean_px
+        py = steer_axis[i, 1] + bx * s + by * c - mean_py
+        moment += px * (s * sensed[i, 0] + c * sensed[i, 1]) - py * (c * sensed[i, 0] - s * sensed[i, 1])
         spread += px * px + py * py
     omega = moment / spread
-    twist = np.empty(3)
     twist[0] = mean_wx + omega * mean_py
     twist[1] = mean_wy - omega * mean_px
     twist[2] = omega
-    slip = np.empty((n, 2))
     for i in range(n):
-        c, s = wheel[i, 2], wheel[i, 3]
-        vx = twist[0] - omega * wheel[i, 1]
-        vy = twist[1] + omega * wheel[i, 0]
+        c, s = direction[i, 0], direction[i, 1]
+        bx, by = caster_offset[i, 0], caster_offset[i, 1]
+        vx = twist[0] - omega * (steer_axis[i, 1] + bx * s + by * c)
+        vy = twist[1] + omega * (steer_axis[i, 0] + bx * c - by * s)
         slip[i, 0] = sensed[i, 0] - (c * vx + s * vy)
         slip[i, 1] = sensed[i, 1] - (-s * vx + c * vy)
+    return mean_px, mean_py, spread
+
+
+@compiled
+def rigid_motion_kernel(steer_axis, caster_offset, steer_angle, sensed):  # type: ignore[no-untyped-def]
+    """Return A^+ w (3,), what of w contradicts it (n, 2) and (A^T A)^-1 (3, 3), of velocities w (n, 2) in the wheel frames."""
+    n = len(steer_angle)
+    direction = np.empty((n, 2))
+    for i in range(n):
+        direction[i, 0], direction[i, 1] = math.cos(steer_angle[i]), math.sin(steer_angle[i])
+    twist, slip = np.empty(3), np.empty((n, 2))
+    mean_px, mean_py, spread = registration_kernel(steer_axis, caster_offset, direction, sensed, twist, slip)
     normal_inverse = np.empty((3, 3))
     normal_inverse[0, 0] = 1.0 / n + mean_py * mean_py / spread
     normal_inverse[1, 1] = 1.0 / n + mean_px * mean_px / spread

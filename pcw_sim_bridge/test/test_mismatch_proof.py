@@ -205,9 +205,9 @@ def test_what_is_retuned_beside_effects_of_other_channels_is_proved(deviating: P
     assert not explanation.named
     prover = Prover(
         nominal, opened, [], lambda e: {n.name: 0.0 for n in e.search.problem.nuisances}, lambda e, _: e,
-        np.random.default_rng(0), besides,
+        np.random.default_rng(0),
     )  # fmt: skip
-    finding = prover.prove(explanation).finding
+    finding = prover.prove(explanation, besides).finding
     assert finding.rollout_gap_closed is not None
     if besides:
         assert min(finding.gap_closed, finding.rollout_gap_closed) > 0.8

@@ -14,7 +14,8 @@ import numpy as np
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects, also_known, get
 
-from .command_findings import command_findings
+from .all_cores import beside
+from .command_findings import CommandFindings, command_findings
 from .explanation import Explanation, NamedTerm, explain, explanation_by
 from .findings import (
     ChannelFinding,
@@ -110,14 +111,17 @@ def analyse(
         return Analysis(empty, subject)
     samples, channels = problem.residual.shape
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
-    explanation = explain(problem, np.random.default_rng(seed), settings, progress)
-    progress("proving it on held-out data")
-    commands = command_findings(
-        subject.command_problems(opened), subject.command_problems(held_out), seed, settings, progress
+
+    def needs_no_explanation() -> tuple[CommandFindings, Prover]:
+        fitted, others = subject.command_problems(opened), subject.command_problems(held_out)
+        prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
+        return command_findings(fitted, others, seed, settings, progress), prover
+
+    explanation, (commands, prover) = beside(
+        lambda: explain(problem, np.random.default_rng(seed), settings, progress), needs_no_explanation
     )
-    generator = np.random.default_rng(seed)
-    prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, generator, bool(commands.named))
-    proof = prover.prove(explanation)
+    progress("proving it on held-out data")
+    proof = prover.prove(explanation, bool(commands.named))
     explanation = proof.explanation
     problem = explanation.search.problem
     everything = [*((named, _instance(named)) for named in explanation.named), *commands.named]

@@ -86,9 +86,12 @@ class ColumnBank:
             self._kept |= zip(new, range(before, count), strict=True)
             if count > self._total.shape[0]:
                 self._make_room(max(count + ROOM, 2 * before))
-            everything = self._data[list(self._kept)]
+            # The first in the bank are asked for first, and need not be gathered.
+            lead = next((row for row, place in enumerate(self._kept) if place != row), count)
+            first, others, added = self._data[:lead], self._data[list(self._kept)[lead:]], self._data[new]
             for k, piece in enumerate(self._blocks):
-                self._by_block[k, :count, before:count] = everything[:, piece] @ everything[before:, piece].T
+                self._by_block[k, :lead, before:count] = first[:, piece] @ added[:, piece].T
+                self._by_block[k, lead:count, before:count] = others[:, piece] @ added[:, piece].T
             self._by_block[:, before:count, :before] = self._by_block[:, :before, before:count].transpose(0, 2, 1)
             self._total[:count, before:count] = self._by_block[:, :count, before:count].sum(axis=0)
             self._total[before:count, :before] = self._total[:before, before:count].T

@@ -84,12 +84,12 @@ class EffectSearch(SetGrowth):
             # Exact there, but with the columns of the description: those of effects are so, too, and are compared with them.
             self.problem = plain.exact_at(self.problem.point.changes, ())
         instances = self.over_complete()
-        regression = self.whiten_at(self.residual_of(instances))
+        regression = self.whiten_beside(instances)
         for _ in range(3):
             before = instances
             instances = self.improve(regression, self.thin(regression, instances))
             instances = self.grow(regression, instances, self.settings.lenient_gain)
-            regression = self.whiten_at(self.residual_of(instances))
+            regression = self.whiten_beside(instances)
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
         threshold = self.calibrate(regression, instances)
@@ -102,10 +102,10 @@ class EffectSearch(SetGrowth):
         """
         for count in range(SECOND_THOUGHTS + 1):
             chosen = self.made_exact(selection.fit.instances)
-            regression = self.whiten_at(self.residual_of(chosen))
+            regression = self.whiten_beside(chosen)
             wider = self.grow(regression, chosen, threshold, settling=True) if count < SECOND_THOUGHTS else chosen
             if _terms(wider) != _terms(chosen):
-                here, under = (self.problem, self._point), self.whiten_at(self.residual_of(wider))
+                here, under = (self.problem, self._point), self.whiten_beside(wider)
                 selection = self.prune(under, wider, threshold)
                 found = selection.fit.instances
                 # What was added may push out what is there, and then be dropped itself: that is no reason to name less.
@@ -139,7 +139,7 @@ class EffectSearch(SetGrowth):
             if loss < selection.threshold:
                 self._note_drop(self.label(instance), loss, "re-tuning does the same")
                 self._exact_at(instead)
-                regression = self.whiten_at(self.residual_of(others))
+                regression = self.whiten_beside(others)
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
         return selection
 
@@ -334,7 +334,7 @@ class EffectSearch(SetGrowth):
     def conclude(self, instances: Sequence[Instance], threshold: float) -> Selection:
         """Settle on a set: noise, fit and figures as they are with just these effects."""
         chosen = tuple(instances)
-        regression = self.whiten_at(self.residual_of(chosen))
+        regression = self.whiten_beside(chosen)
         fit = regression.fit(chosen)
         losses, held_out, _ = EffectGates(self.problem, self.settings).judge(regression, chosen, fit)
         named = [

@@ -42,6 +42,9 @@ class ExactProblem:
         self.block = block
         # Where the problem is exact: all numbers of the description by name, of effects by term, shape and parameter.
         self._point: dict[object, float] | None = None
+        # Of the problem and set that were last asked for: one step of a search ends where the next one begins.
+        self._last_left: tuple[RegressionProblem, tuple[Instance, ...], FloatArray, float] | None = None
+        self._last_beside: tuple[FloatArray, WhitenedRegression] | None = None
 
     def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
         """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
@@ -60,12 +63,23 @@ class ExactProblem:
 
     def _left_and_cost(self, instances: Sequence[Instance]) -> tuple[FloatArray, float]:
         """The same with what its re-tuning costs [nats]."""
+        last, wanted = self._last_left, tuple(instances)
+        if last is not None and last[0] is self.problem and last[1] == wanted:
+            return last[2], last[3]
         residual, cost = self.problem.residual, 0.0
         for _ in range(3):
             regression = self.whiten_at(residual, white=True)
             fit = regression.fit(instances)
             residual, cost = regression.unwhitened_residual(fit), regression.tolerance_cost(fit)
+        self._last_left = self.problem, wanted, residual, cost
         return residual, cost
+
+    def whiten_beside(self, instances: Sequence[Instance]) -> WhitenedRegression:
+        """Whiten the problem by the noise that a set leaves."""
+        residual = self.residual_of(instances)
+        if self._last_beside is None or self._last_beside[0] is not residual:
+            self._last_beside = residual, self.whiten_at(residual)
+        return self._last_beside[1]
 
     def _error(self, residual: FloatArray, noise: FloatArray) -> float:
         """Sum of squares of a residual (T, C) in units of the deviations of another, outliers held down."""
@@ -86,7 +100,7 @@ class ExactProblem:
             if count == (2 * DERIVED_AFTER if known else DERIVED_AFTER):
                 self.problem = self.problem.derived()
             residual, cost = self._left_and_cost(instances)
-            fit = self.whiten_at(residual).fit(instances)
+            fit = self.whiten_beside(instances).fit(instances)
             allowed = GROWTH * self._error(residual, residual) + 2.0 * cost
             before = self.problem, self._point
             for part in STEPS:

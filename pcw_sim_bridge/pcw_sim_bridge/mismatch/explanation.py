@@ -350,7 +350,7 @@ def _searched_again(search: EffectSearch, refined: _Refined, threshold: float) -
     """The refined set with what the plain law hid added, and its other stand-ins exchanged or dropped."""
     keeper = refined.instances[refined.position]
     solid = tuple(instance for instance in refined.instances if instance not in refined.undecided)
-    regression = search.whiten_at(search.residual_of(refined.instances))
+    regression = search.whiten_beside(refined.instances)
     grown = search.grow(regression, search.improve(regression, solid), search.settings.lenient_gain)
     found = search.prune(regression, grown, threshold).fit.instances
     if keeper not in found:

@@ -15,6 +15,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import signal as filters
 
+from pcw_description.compiled import compiled
+
 from .noise_model import robust_deviation
 from .regression_problem import BoolArray, FloatArray, IntArray, Nuisance
 
@@ -221,17 +223,8 @@ def waves(looked: Looked, climbing: FloatArray) -> ChosenShapes:
     extent = max(float(np.ptp(x)), float(np.ptp(y)), 1e-3)
     numbers = np.arange(1.0 / WAVES[1], 1.0 / WAVES[0], min(0.25 / extent, 0.5))
     directions = np.arange(WAVE_DIRECTIONS) * math.tau / WAVE_DIRECTIONS
-    gain = np.zeros((len(numbers), len(directions)))
-    for column, direction in enumerate(directions):
-        c, s = math.cos(direction), math.sin(direction)
-        along, across = c * x + s * y, -s * x + c * y
-        to_wave = looked.heading - direction
-        forward, aside = np.cos(to_wave), np.sin(to_wave)
-        for row, number in enumerate(numbers):
-            k = math.tau * number
-            slope = k * (np.cos(k * along) * np.cos(k * across) * forward - np.sin(k * along) * np.sin(k * across) * aside)
-            moment, energy = float(np.sum(held * slope)), float(np.sum(there * slope**2))
-            gain[row, column] = moment**2 / max(energy, 1e-300) if moment > 0.0 else 0.0
+    moment, energy = _wave_sums(held, there, x, y, looked.heading, numbers, directions)
+    gain = np.where(moment > 0.0, moment**2 / np.maximum(energy, 1e-300), 0.0)
     tried = gain.size
     shapes: list[dict[str, float]] = []
     for _ in range(2 * MOST_SHAPES):
@@ -242,3 +235,36 @@ def waves(looked: Looked, climbing: FloatArray) -> ChosenShapes:
         gain[max(0, best - 1) : best + 2, way] = 0.0
     spacing = 0.5 * math.tau / WAVE_DIRECTIONS
     return ChosenShapes(tuple(shapes), tried, {"wavelength": ("log", 1.12), "direction": ("linear", spacing)})
+
+
+@compiled
+def _wave_sums(held, there, x, y, heading, numbers, directions):  # type: ignore[no-untyped-def]
+    """Sums over samples and wheels of slope times `held`, and of its square times `there`, (M, D) each.
+
+    The slope under a wheel of a wave of number k, by its place along and across the wave and its heading phi to it, is
+    k (cos(k along) cos(k across) cos(phi) - sin(k along) sin(k across) sin(phi)).
+
+    Args:
+        held, there, x, y, heading: (T, n); numbers: of the waves (M,), evenly spaced [1/m]; directions: of these (D,) [rad].
+    """
+    moment, energy = np.zeros((len(numbers), len(directions))), np.zeros((len(numbers), len(directions)))
+    step = math.tau * (numbers[1] - numbers[0]) if len(numbers) > 1 else 0.0
+    for d in range(len(directions)):
+        c, s = math.cos(directions[d]), math.sin(directions[d])
+        for t in range(held.shape[0]):
+            for i in range(held.shape[1]):
+                if held[t, i] == 0.0 and there[t, i] == 0.0:
+                    continue
+                along, across = c * x[t, i] + s * y[t, i], -s * x[t, i] + c * y[t, i]
+                forward, aside = math.cos(heading[t, i] - directions[d]), math.sin(heading[t, i] - directions[d])
+                # Products of cosines as cosines of sums, each turned on from one wave to the next.
+                k = math.tau * numbers[0]
+                one, other = np.exp(1j * k * (along + across)), np.exp(1j * k * (along - across))
+                turn_one, turn_other = np.exp(1j * step * (along + across)), np.exp(1j * step * (along - across))
+                for m in range(len(numbers)):
+                    slope = math.pi * numbers[m] * (one.real * (forward + aside) + other.real * (forward - aside))
+                    moment[m, d] += held[t, i] * slope
+                    energy[m, d] += there[t, i] * slope * slope
+                    one *= turn_one
+                    other *= turn_other
+    return moment, energy

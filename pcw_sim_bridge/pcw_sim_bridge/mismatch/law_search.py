@@ -186,7 +186,7 @@ class LawSearch:
 
     def _judged(self, best: _Trial) -> FoundLaw | None:
         problem = best.search.problem
-        regression = best.search.whiten_at(self._left_by(best))
+        regression = best.search.whiten_beside(best.instances)
         with_law, without = regression.fit(best.instances), regression.fit(self.names)
         gain = with_law.log_evidence - without.log_evidence
         scores = [_held_out_error(regression, i) for i in (best.instances, self.names, best.names)]

@@ -61,17 +61,42 @@ class NoiseModel:
         return _filtered(wide, position, *_weights(self.taps.tobytes(), self.taps.shape)).reshape(values.shape)
 
     def whiten(self, values: FloatArray, valid: BoolArray, segment: IntArray) -> FloatArray:
-        """Return whitened values: (T, C) or (T, C, K) -> the same shape, zero where not valid.
+        """Return whitened values: (T, C) or (T, C, K) -> the same shape, zero where not valid."""
+        samples = np.flatnonzero(valid)
+        flat = np.zeros((valid.size, values[0, 0].size))
+        flat[samples] = self.whitened_rows(values, valid, segment, samples, np.ones(len(samples)))
+        return flat.reshape(values.shape)
+
+    def whitened_rows(
+        self, values: FloatArray, valid: BoolArray, segment: IntArray, samples: IntArray, weights: FloatArray
+    ) -> FloatArray:
+        """Return whitened values (R, K) at some valid samples, each times a weight; a column is in one piece of memory.
 
         Rows with some channels masked are decorrelated with the correlation of the others.
+
+        Args:
+            values: (T, C) or (T, C, K).
+            samples: places in `valid` as one line (R,); weights: of these (R,).
         """
+        wide = np.ascontiguousarray(values, dtype=np.float64).reshape(*valid.shape, -1)
         if self.is_white:  # nothing ties a sample to others
-            scale = np.where(valid, self.taps[:, 0], 0.0)
-            return values * scale.reshape(*scale.shape, *(1,) * (values.ndim - 2))
-        filtered = self.filtered(values, valid, segment).reshape(*valid.shape, -1)
-        _, pattern, present = _positions(valid.tobytes(), valid.shape, segment.tobytes())
+            scale = self.taps[samples % valid.shape[1], 0] * weights
+            return _picked(wide.reshape(valid.size, -1), samples, scale).T
+        position, pattern, present = _positions(valid.tobytes(), valid.shape, segment.tobytes())
         roots = _inverse_roots(self.correlation.tobytes(), present.tobytes(), present.shape)
-        return _decorrelated(filtered, pattern, roots).reshape(values.shape)
+        row = np.full(valid.shape, -1)
+        row.ravel()[samples] = np.arange(len(samples))
+        return _whitened(wide, position, *_weights(self.taps.tobytes(), self.taps.shape), pattern, roots, row, weights).T
+
+
+@compiled
+def _picked(values, samples, scale):  # type: ignore[no-untyped-def]
+    """Some rows of values (N, K), each times a factor (R,), as (K, R)."""
+    result = np.empty((values.shape[1], len(samples)))
+    for r in range(len(samples)):
+        for k in range(values.shape[1]):
+            result[k, r] = values[samples[r], k] * scale[r]
+    return result
 
 
 @compiled
@@ -91,15 +116,41 @@ def _filtered(values, position, weights, lengths):  # type: ignore[no-untyped-de
 
 
 @compiled
-def _decorrelated(values, pattern, roots):  # type: ignore[no-untyped-def]
-    """Multiply the channels of each row (T, C, K) by the matrix (P, C, C) of its pattern."""
-    result = np.empty_like(values)
+def _whitened(values, position, weights, lengths, pattern, roots, row, factor):  # type: ignore[no-untyped-def]
+    """Filter (T, C, K) as `_filtered`, multiply the channels of each sample by the matrix (P, C, C) of its pattern.
+
+    What comes out stands at the row (T, C) of the result (K, R), times a factor (R,); nowhere if that is negative.
+    """
+    channels, width = values.shape[1:]
+    result = np.empty((width, len(factor)))
+    filtered, mixed = np.empty((channels, width)), np.empty(width)
     for t in range(values.shape[0]):
-        np.dot(roots[pattern[t]], values[t], result[t])
+        for c in range(channels):
+            filtered[c] = 0.0
+            if position[t, c] < 0:
+                continue
+            first = min(position[t, c], lengths[c] - 1)
+            for lag in range(first + 1):
+                weight = weights[c, first, lag]
+                for k in range(width):
+                    filtered[c, k] += weight * values[t - lag, c, k]
+        root = roots[pattern[t]]
+        for c in range(channels):
+            r = row[t, c]
+            if r < 0:
+                continue
+            mixed[:] = 0.0
+            for other in range(c + 1):  # the roots are lower triangles
+                weight = root[c, other] * factor[r]
+                if weight != 0.0:
+                    for k in range(width):
+                        mixed[k] += weight * filtered[other, k]
+            for k in range(width):
+                result[k, r] = mixed[k]
     return result
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=16)
 def _positions(content: bytes, shape: tuple[int, int], segments: bytes) -> tuple[IntArray, IntArray, BoolArray]:
     """Of valid samples (T, C): places after gaps (T, C), and the pattern (T,) of those present (P, C) in each row."""
     valid, segment = np.frombuffer(content, dtype=np.bool_).reshape(shape), np.frombuffer(segments, dtype=np.int64)
@@ -185,10 +236,21 @@ def robust_deviation(values: FloatArray) -> float:
         deviation = float(np.sqrt(np.mean(values**2)))
     if deviation <= LEAST_DEVIATION:
         return LEAST_DEVIATION
+    return max(_huber_deviation(values, deviation), LEAST_DEVIATION)
+
+
+@compiled
+def _huber_deviation(values, deviation):  # type: ignore[no-untyped-def]
+    """Root mean square of values (T,), those beyond `HUBER` deviations held down; from a first guess in three rounds."""
     for _ in range(3):
-        weight = huber_weights(values / deviation)
-        deviation = float(np.sqrt(np.sum(weight * values**2) / np.sum(weight)))
-    return max(deviation, LEAST_DEVIATION)
+        squares, weights = 0.0, 0.0
+        for t in range(len(values)):
+            size = abs(values[t]) / deviation
+            weight = HUBER / size if size > HUBER else 1.0
+            squares += weight * values[t] * values[t]
+            weights += weight
+        deviation = np.sqrt(squares / weights)
+    return deviation
 
 
 def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -> NoiseModel:

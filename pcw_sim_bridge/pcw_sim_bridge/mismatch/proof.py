@@ -93,7 +93,6 @@ class Prover:
         retune: Retune,
         reduce: Reduce,
         rng: np.random.Generator,
-        besides: bool = False,
     ) -> None:
         """Open the held-out data.
 
@@ -104,9 +103,8 @@ class Prover:
             retune: explanation -> numbers of the description that go into the patch.
             reduce: explanation, effects that stay -> the explanation by these alone.
             rng: of bootstrap and noise.
-            besides: other effects are found by other channels, so that there is a patch in any case.
         """
-        self.besides = besides
+        self.besides = False
         self.subject, self.retune, self.reduce, self.rng = subject, retune, reduce, rng
         self.other = subject.problem(held_out) if held_out else None
         self.unusable = self.other is not None and self.other.valid.any(axis=1).sum() < LEAST_DURATION * self.other.rate
@@ -120,12 +118,17 @@ class Prover:
         self.tuned = True
         self.laws: LawModels
 
-    def prove(self, explanation: Explanation) -> Proof:
+    def prove(self, explanation: Explanation, besides: bool = False) -> Proof:
         """Drop what does not help, and hold the rest against the data.
+
+        Args:
+            explanation: to be judged.
+            besides: other effects are found by other channels, so that there is a patch in any case.
 
         Raises:
             MismatchError: the held-out recordings fill other channels than the fitted ones.
         """
+        self.besides = besides
         dropped: list[LadderFinding] = []
         notes: list[str] = []
         refused: set[Instance] = set()

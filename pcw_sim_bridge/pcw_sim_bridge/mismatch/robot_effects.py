@@ -61,6 +61,7 @@ from .rolling_model import (
     Surroundings,
     acceleration_of,
     channel_sides,
+    directions,
     normal_forces,
     twists,
 )
@@ -106,7 +107,8 @@ def normal_along(motion: RobotMotion, numbers: ModelNumbers, height: FloatArray 
     """Normal forces (T, n) [N] along a motion, over ground of a height (T, n) [m]."""
     angle = numbers.headings(motion.position)
     twist, _ = twists(numbers, angle, motion.velocity)
-    normal = normal_forces(numbers, angle, acceleration_of(twist, derivative(twist, motion.rate)), height)
+    acceleration = acceleration_of(twist, derivative(twist, motion.rate))
+    normal = normal_forces(numbers, directions(angle), acceleration, height)
     return np.ascontiguousarray(normal[:, : len(numbers.steer_axis)])
 
 

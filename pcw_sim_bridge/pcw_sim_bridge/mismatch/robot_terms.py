@@ -357,7 +357,8 @@ def _once_more(
     known = {frozen(shape): found}
 
     def kept(shape: Shape) -> FloatArray:
-        return known.pop(frozen(shape)) if frozen(shape) in known else columns(shape)
+        once = known.pop(frozen(shape), None)
+        return columns(shape) if once is None else once
 
     return kept
 

@@ -44,6 +44,7 @@ from pcw_description.contact.contact_model import (
 from pcw_description.differential_kinematics import (
     axle_row_kernel,
     guided_motion_kernel,
+    registration_kernel,
     wheel_jacobian_kernel,
 )
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
@@ -148,9 +149,21 @@ class StraightTyres:
 
     def ratios(self, force: FloatArray, grip: FloatArray) -> FloatArray:
         """Slip ratios (T, n, 2) under other forces and loads."""
-        change = (self.of_force @ (force - self.force)[..., None])[..., 0]
-        result: FloatArray = self.ratio + change + self.of_grip * (grip - self.grip)[:, :, None]
+        result: FloatArray = _straight_ratios(self.ratio, self.of_force, self.of_grip, force, self.force, grip, self.grip)
         return result
+
+
+@compiled
+def _straight_ratios(ratio, of_force, of_grip, force, force_there, grip, grip_there):  # type: ignore[no-untyped-def]
+    found = np.empty_like(ratio)
+    for t in range(ratio.shape[0]):
+        for i in range(ratio.shape[1]):
+            along, across = force[t, i, 0] - force_there[t, i, 0], force[t, i, 1] - force_there[t, i, 1]
+            load = grip[t, i] - grip_there[t, i]
+            for k in range(2):
+                change = of_force[t, i, k, 0] * along + of_force[t, i, k, 1] * across
+                found[t, i, k] = ratio[t, i, k] + change + of_grip[t, i, k] * load
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -276,63 +289,81 @@ class ModelNumbers:
         )
 
 
+def directions(steer_angle: FloatArray) -> FloatArray:
+    """Cosines and sines (T, n, 2) of headings (T, n): all that most of the model knows of them, taken once."""
+    return np.stack([np.cos(steer_angle), np.sin(steer_angle)], axis=2)
+
+
 @compiled
-def _rigid_motions(steer_axis, offset, axle, steer_angle, sensed):  # type: ignore[no-untyped-def]
-    twist = np.empty((len(sensed), 3))
-    contradiction = np.empty_like(sensed)
-    for t in range(len(sensed)):
-        twist[t], contradiction[t], _ = guided_motion_kernel(steer_axis, offset[t], axle, steer_angle[t], sensed[t])
+def _rigid_motions(steer_axis, offset, axle, steer_angle, direction, velocity):  # type: ignore[no-untyped-def]
+    twist, contradiction = np.empty((len(velocity), 3)), np.empty_like(velocity)
+    for t in range(len(velocity)):
+        if len(axle) == 0:
+            registration_kernel(steer_axis, offset[t], direction[t], velocity[t], twist[t], contradiction[t])
+        else:
+            twist[t], contradiction[t], _ = guided_motion_kernel(steer_axis, offset[t], axle, steer_angle[t], velocity[t])
     return twist, contradiction
 
 
 def rigid_motions(
-    numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray, offset: FloatArray | None = None
+    numbers: ModelNumbers, steer_angle: FloatArray, direction: FloatArray, velocity: FloatArray, offset: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Split velocities (T, n, 2) in the wheel frames into the twist A^+ w (T, 3) and what contradicts it (T, n, 2).
 
     Those of fixed axles come last, (T, n + k, 2); where they are left out, nothing moves along them.
 
     Args:
-        offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m]; None: the described ones.
+        steer_angle, direction: headings (T, n) [rad], and `directions` of them.
+        offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m].
     """
     n = len(numbers.steer_axis)
     missing = n + len(numbers.axle) - velocity.shape[1]
     if missing:
         velocity = np.concatenate([velocity, np.zeros((len(velocity), missing, 2))], axis=1)
     twist, contradiction = _rigid_motions(
-        numbers.steer_axis, _offsets(numbers, steer_angle) if offset is None else offset, numbers.axle,
-        np.ascontiguousarray(steer_angle), velocity,
-    )  # fmt: skip
+        numbers.steer_axis, offset, numbers.axle, np.ascontiguousarray(steer_angle), direction, velocity
+    )
     return twist, np.ascontiguousarray(contradiction[:, :n])
 
 
-def _offsets(numbers: ModelNumbers, steer_angle: FloatArray, tilt: FloatArray | None = None) -> FloatArray:
+def _offsets(
+    numbers: ModelNumbers, direction: FloatArray, tilt: FloatArray | None = None
+) -> FloatArray:
     """Offsets (T, n, 2) [m] of the contacts from the steering axes, of a chassis that is tilted so (T, 2); None: upright."""
-    offsets = np.empty((*steer_angle.shape, 2))
+    offsets = np.empty(direction.shape)
     offsets[:] = numbers.caster_offset
     if tilt is not None:
-        ahead = np.cos(steer_angle) * tilt[:, :1] + np.sin(steer_angle) * tilt[:, 1:]
-        offsets[:, :, 0] -= numbers.radius * ahead
+        offsets[:, :, 0] -= numbers.radius * (direction[:, :, 0] * tilt[:, :1] + direction[:, :, 1] * tilt[:, 1:])
     return offsets
 
 
-def rolling_velocities(numbers: ModelNumbers, velocity: FloatArray, offset: FloatArray | None = None) -> FloatArray:
+@compiled
+def _rolling_velocities(radius, offset, velocity):  # type: ignore[no-untyped-def]
     """Velocities B q_dot (T, n, 2) of the wheel centres in the wheel frames that joint rates (T, n, 2) make without slip."""
-    offset_x, offset_y = np.moveaxis(numbers.caster_offset if offset is None else offset, -1, 0)
-    along = numbers.radius * velocity[:, :, DRIVE] + offset_y * velocity[:, :, STEER]
-    return np.stack([along, -offset_x * velocity[:, :, STEER]], axis=2)
+    found = np.empty(velocity.shape)
+    for t in range(velocity.shape[0]):
+        for i in range(velocity.shape[1]):
+            found[t, i, 0] = radius[i] * velocity[t, i, 0] + offset[t, i, 1] * velocity[t, i, 1]
+            found[t, i, 1] = -offset[t, i, 0] * velocity[t, i, 1]
+    return found
 
 
-def twists(
-    numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray, offset: FloatArray | None = None
+def _twists(
+    numbers: ModelNumbers, steer_angle: FloatArray, direction: FloatArray, velocity: FloatArray, offset: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
+    rolling = _rolling_velocities(numbers.radius, offset, velocity)
+    return rigid_motions(numbers, steer_angle, direction, rolling, offset)
+
+
+def twists(numbers: ModelNumbers, steer_angle: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Wheels' twist (T, 3) and what of each wheel's motion contradicts it (T, n, 2) [m/s], of joint rates (T, n, 2)."""
-    return rigid_motions(numbers, steer_angle, rolling_velocities(numbers, velocity, offset), offset)
+    direction = directions(steer_angle)
+    return _twists(numbers, steer_angle, direction, velocity, _offsets(numbers, direction))
 
 
 @compiled
 def _contact_forces(  # type: ignore[no-untyped-def]
-    modules, steer_axis, offset, radius, steer_angle, velocity, acceleration, torque, spin, twist, twist_dot, normal, tilt
+    modules, steer_axis, offset, radius, direction, velocity, acceleration, torque, spin, twist, twist_dot, normal, tilt
 ):
     """Forces at the contacts in the wheel frames from each joint's balance, (T, n, 2) [N].
 
@@ -342,7 +373,7 @@ def _contact_forces(  # type: ignore[no-untyped-def]
     for t in range(len(torque)):
         vx, vy, omega = twist[t, 0], twist[t, 1], twist[t, 2]
         for i in range(torque.shape[1]):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
+            c, s = direction[t, i, 0], direction[t, i, 1]
             m, cx, cy = modules[i, 0], modules[i, 1], modules[i, 2]
             lever_x, lever_y = cx * c - cy * s, cx * s + cy * c
             sx, sy = steer_axis[i, 0], steer_axis[i, 1]
@@ -385,12 +416,12 @@ def _contact_forces(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _wrench_of(steer_axis, offset, steer_angle, force, spin):  # type: ignore[no-untyped-def]
+def _wrench_of(steer_axis, offset, direction, force, spin):  # type: ignore[no-untyped-def]
     """Wrench on the base (T, 3) of contact forces (T, n, 2) and of torques about the vertical (T, n)."""
     wrench = np.zeros((len(force), 3))
     for t in range(len(force)):
-        for i in range(steer_angle.shape[1]):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
+        for i in range(direction.shape[1]):
+            c, s = direction[t, i, 0], direction[t, i, 1]
             fx, fy = force[t, i, 0], force[t, i, 1]
             bx, by = offset[t, i, 0], offset[t, i, 1]
             px = steer_axis[i, 0] + bx * c - by * s
@@ -404,7 +435,7 @@ def _wrench_of(steer_axis, offset, steer_angle, force, spin):  # type: ignore[no
 
 @compiled
 def _inertial_wrench(  # type: ignore[no-untyped-def]
-    chassis, modules, steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
+    chassis, modules, steer_axis, direction, velocity, acceleration, twist, twist_dot
 ):
     """Wrench (T, 3) that accelerates chassis and modules as they move; rotors and rolling wheels are not in it."""
     wrench = np.empty_like(twist)
@@ -415,10 +446,10 @@ def _inertial_wrench(  # type: ignore[no-untyped-def]
         ax, ay = dx - alpha * cy - omega * omega * cx, dy + alpha * cx - omega * omega * cy
         fx, fy, moment = mass * ax, mass * ay, chassis[3] * alpha + mass * (cx * ay - cy * ax)
         for i in range(len(modules)):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
+            c, s = direction[t, i, 0], direction[t, i, 1]
             lever_x, lever_y = modules[i, 1] * c - modules[i, 2] * s, modules[i, 1] * s + modules[i, 2] * c
             sx, sy = steer_axis[i, 0], steer_axis[i, 1]
-            sigma, sigma_dot = steer_rate[t, i] + omega, steer_acceleration[t, i] + alpha
+            sigma, sigma_dot = velocity[t, i, 1] + omega, acceleration[t, i, 1] + alpha
             ax = dx - alpha * sy - omega * omega * sx - sigma_dot * lever_y - sigma * sigma * lever_x
             ay = dy + alpha * sx - omega * omega * sy + sigma_dot * lever_x - sigma * sigma * lever_y
             m = modules[i, 0]
@@ -429,27 +460,39 @@ def _inertial_wrench(  # type: ignore[no-untyped-def]
     return wrench
 
 
-def mass_centre(numbers: ModelNumbers, steer_angle: FloatArray) -> FloatArray:
-    """Centre of mass of chassis and modules (T, 2) [m], the wheels at their headings (T, n)."""
-    chassis, modules = numbers.chassis, numbers.modules
-    c, s = np.cos(steer_angle), np.sin(steer_angle)
-    lever_x, lever_y = modules[:, 1] * c - modules[:, 2] * s, modules[:, 1] * s + modules[:, 2] * c
-    moment = chassis[0] * chassis[1:3] + modules[:, 0] @ numbers.steer_axis
-    centre: FloatArray = (moment + np.stack([lever_x @ modules[:, 0], lever_y @ modules[:, 0]], axis=1)) / numbers.total_mass
+@compiled
+def _mass_centre(chassis, modules, steer_axis, direction, total_mass):  # type: ignore[no-untyped-def]
+    """Centre of mass of chassis and modules (T, 2) [m]."""
+    centre = np.empty((len(direction), 2))
+    for t in range(len(direction)):
+        x, y = chassis[0] * chassis[1], chassis[0] * chassis[2]
+        for i in range(len(modules)):
+            c, s = direction[t, i, 0], direction[t, i, 1]
+            x += modules[i, 0] * (steer_axis[i, 0] + modules[i, 1] * c - modules[i, 2] * s)
+            y += modules[i, 0] * (steer_axis[i, 1] + modules[i, 1] * s + modules[i, 2] * c)
+        centre[t, 0], centre[t, 1] = x / total_mass, y / total_mass
+    return centre
+
+
+def mass_centre(numbers: ModelNumbers, direction: FloatArray) -> FloatArray:
+    """Centre of mass of chassis and modules (T, 2) [m], the wheels in their directions (T, n, 2)."""
+    centre: FloatArray = _mass_centre(
+        numbers.chassis, numbers.modules, numbers.steer_axis, direction, numbers.total_mass
+    )
     return centre
 
 
 @compiled
 def _normal_forces(  # type: ignore[no-untyped-def]
-    mass, com, height_of_mass, spring, steer_axis, caster_offset, axle, steer_angle, acceleration, height
+    mass, com, height_of_mass, spring, steer_axis, caster_offset, axle, direction, acceleration, height
 ):
     """Quasi-static normal forces (T, n + k) [N] from centre of mass and accelerations (T, 2), over a height (T, n + k)."""
     normal = np.empty_like(height)
     centre = np.empty((height.shape[1], 2))
     centre[len(steer_axis) :] = axle[:, :2]
-    for t in range(len(steer_angle)):
-        for i in range(steer_angle.shape[1]):
-            c, s = np.cos(steer_angle[t, i]), np.sin(steer_angle[t, i])
+    for t in range(len(direction)):
+        for i in range(direction.shape[1]):
+            c, s = direction[t, i, 0], direction[t, i, 1]
             centre[i, 0] = steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
             centre[i, 1] = steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
         moment_x = mass * (GRAVITY * com[t, 0] - height_of_mass * acceleration[t, 0])
@@ -459,21 +502,22 @@ def _normal_forces(  # type: ignore[no-untyped-def]
 
 
 def normal_forces(
-    numbers: ModelNumbers, steer_angle: FloatArray, acceleration: FloatArray, height: FloatArray | None = None
+    numbers: ModelNumbers, direction: FloatArray, acceleration: FloatArray, height: FloatArray | None = None
 ) -> FloatArray:
     """Quasi-static normal forces (T, n + k) [N] on the wheels, then on fixed axles.
 
     Args:
-        acceleration: of base_link in its own axes (T, 2 or more).
+        direction: of the wheels (T, n, 2).
+        acceleration: of base_link in its own axes (T, 2).
         height: of the ground under each wheel (T, n) [m]; None where it is level.
     """
     # On level ground the load does not depend on how stiff equal springs are, and rigid ones know no other.
-    ground = np.zeros((len(steer_angle), steer_angle.shape[1] + len(numbers.axle)))
+    ground = np.zeros((len(direction), direction.shape[1] + len(numbers.axle)))
     if height is not None and numbers.spring > 0.0:
         ground[:, : height.shape[1]] = height
     forces: FloatArray = _normal_forces(
-        numbers.total_mass, mass_centre(numbers, steer_angle), numbers.height_of_mass, numbers.spring or 1.0,
-        numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, acceleration, ground,
+        numbers.total_mass, mass_centre(numbers, direction), numbers.height_of_mass, numbers.spring or 1.0,
+        numbers.steer_axis, numbers.caster_offset, numbers.axle, direction, acceleration, ground,
     )  # fmt: skip
     return forces
 
@@ -533,8 +577,9 @@ def slips(
     else:
         ratio = slip_ratios(numbers.tyres, force, grip)
     ratio = numbers.softness * ratio
-    ratio = ratio - DAMPING_TIME * derivative(ratio, rate)
-    result: FloatArray = speed[:, :, None] * ratio + numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
+    ratio -= DAMPING_TIME * derivative(ratio, rate)
+    result: FloatArray = speed[:, :, None] * ratio
+    result += numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
     return result
 
 
@@ -548,12 +593,11 @@ def _axle_speeds(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
 
 
 def inertial_wrench(
-    numbers: ModelNumbers, motion: RobotMotion, steer_angle: FloatArray, twist: FloatArray, twist_dot: FloatArray
+    numbers: ModelNumbers, motion: RobotMotion, direction: FloatArray, twist: FloatArray, twist_dot: FloatArray
 ) -> FloatArray:
-    """Wrench (T, 3) that accelerates chassis and modules moving with a twist (T, 3)."""
-    steer_rate, steer_acceleration = (np.ascontiguousarray(a[:, :, STEER]) for a in (motion.velocity, motion.acceleration))
+    """Wrench (T, 3) that accelerates chassis and modules moving with a twist (T, 3), the wheels in directions (T, n, 2)."""
     wrench: FloatArray = _inertial_wrench(
-        numbers.chassis, numbers.modules, numbers.steer_axis, steer_angle, steer_rate, steer_acceleration, twist, twist_dot
+        numbers.chassis, numbers.modules, numbers.steer_axis, direction, motion.velocity, motion.acceleration, twist, twist_dot
     )
     return wrench
 
@@ -569,17 +613,30 @@ def _leaning(numbers: ModelNumbers, rate: float, twist: FloatArray, twist_dot: F
     return leaning
 
 
-def _tilt(numbers: ModelNumbers, leaning: FloatArray, lean: FloatArray, steer_angle: FloatArray) -> FloatArray:
+@compiled
+def _contact_centre(steer_axis, caster_offset, direction):  # type: ignore[no-untyped-def]
+    """Mean (T, 2) [m] of the wheel centres."""
+    n = len(steer_axis)
+    centre = np.empty((len(direction), 2))
+    for t in range(len(direction)):
+        x, y = 0.0, 0.0
+        for i in range(n):
+            c, s = direction[t, i, 0], direction[t, i, 1]
+            x += steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
+            y += steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
+        centre[t, 0], centre[t, 1] = x / n, y / n
+    return centre
+
+
+def _tilt(numbers: ModelNumbers, leaning: FloatArray, lean: FloatArray, direction: FloatArray) -> FloatArray:
     """The vertical in the horizontal axes of the chassis (T, 2): how it leans as it accelerates, and where it stands.
 
     Args:
         leaning: (T, 2) [m], as of `_leaning`; lean: the number it was made with (2,) [s^2].
+        direction: of the wheels (T, n, 2).
     """
-    heading = np.stack([np.cos(steer_angle), np.sin(steer_angle)], axis=2)
-    aside = np.stack([-heading[:, :, 1], heading[:, :, 0]], axis=2)
-    offset_x, offset_y = numbers.caster_offset.T[:, :, None]
-    contact = (numbers.steer_axis + offset_x * heading + offset_y * aside).mean(axis=1)
-    height, aside_of_it = numbers.height_of_mass, mass_centre(numbers, steer_angle) - contact
+    contact = _contact_centre(numbers.steer_axis, numbers.caster_offset, direction)
+    height, aside_of_it = numbers.height_of_mass, mass_centre(numbers, direction) - contact
     tilt: FloatArray = leaning / height - lean * GRAVITY / height**2 * aside_of_it
     return tilt
 
@@ -589,7 +646,7 @@ class RollingState:
     """How the wheels of a robot roll along a motion, before their slip.
 
     Attributes:
-        steer_angle, radius: true headings [rad] and rolling radii [m] (T, n).
+        steer_angle, radius: true headings [rad] and rolling radii [m] (T, n); direction: `directions` of the former.
         offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m].
         velocity: joint rates that wheels of the described radius would have (T, n, 2).
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
@@ -600,6 +657,7 @@ class RollingState:
     """
 
     steer_angle: FloatArray
+    direction: FloatArray
     radius: FloatArray
     offset: FloatArray
     velocity: FloatArray
@@ -628,19 +686,20 @@ def rolling_state(
     radius = np.ascontiguousarray(radius)
     # On a slope, forces and loads are those of a robot that is accelerated uphill.
     pull = np.zeros(2) if around.pull is None else around.pull
-    offset = _offsets(numbers, steer_angle)
-    twist, contradiction = twists(numbers, steer_angle, velocity, offset)
+    direction = directions(steer_angle)
+    offset = _offsets(numbers, direction)
+    twist, contradiction = _twists(numbers, steer_angle, direction, velocity, offset)
     twist_dot = derivative(twist, motion.rate)
     leaning = _leaning(numbers, motion.rate, twist, _without(twist_dot, pull))
     tilt = np.zeros((len(twist), 2))
     if leaning is not None:
-        tilt = _tilt(numbers, leaning, numbers.lean, steer_angle)
-        offset = _offsets(numbers, steer_angle, tilt)
-        twist, contradiction = twists(numbers, steer_angle, velocity, offset)
+        tilt = _tilt(numbers, leaning, numbers.lean, direction)
+        offset = _offsets(numbers, direction, tilt)
+        twist, contradiction = _twists(numbers, steer_angle, direction, velocity, offset)
         twist_dot = derivative(twist, motion.rate)
     felt = _without(twist_dot, pull)
     n = len(numbers.steer_axis)
-    normal = normal_forces(numbers, steer_angle, acceleration_of(twist, felt), around.height)
+    normal = normal_forces(numbers, direction, acceleration_of(twist, felt), around.height)
     grip = np.maximum(normal, 1.0)
     if around.grip is not None:
         grip[:, :n] = np.maximum(normal[:, :n] * around.grip, 1.0)
@@ -656,17 +715,17 @@ def rolling_state(
             torque = torque.copy()
             torque[:, :, DRIVE] += radius * around.climb[:, :, 0]
         load = _contact_forces(
-            numbers.modules, numbers.steer_axis, offset, radius, steer_angle, velocity, motion.acceleration, torque, spin,
+            numbers.modules, numbers.steer_axis, offset, radius, direction, velocity, motion.acceleration, torque, spin,
             twist, felt, normal, tilt,
         )  # fmt: skip
         force = load if around.climb is None else load - around.climb
     else:
-        wrench = inertial_wrench(numbers, motion, steer_angle, twist, felt)
+        wrench = inertial_wrench(numbers, motion, direction, twist, felt)
         if around.climb is not None:
-            wrench = wrench - _wrench_of(numbers.steer_axis, offset, steer_angle, around.climb, np.zeros_like(spin))
+            wrench = wrench - _wrench_of(numbers.steer_axis, offset, direction, around.climb, np.zeros_like(spin))
         force = load = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, wrench)
     return RollingState(
-        steer_angle, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force, load
+        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force, load
     )
 
 
@@ -698,16 +757,16 @@ def channel_sides(
     """
     state = rolling_state(motion, numbers, layout, around)
     slip = slips(numbers, motion.rate, state.speed, state.force, state.grip, around.straight)
-    slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, slip, state.offset)
+    slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, state.direction, slip, state.offset)
     twist = state.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)
     leaning = _leaning(numbers, motion.rate, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
         measured.append(
-            _wrench_of(numbers.steer_axis, state.offset, state.steer_angle, state.load, state.spin)
+            _wrench_of(numbers.steer_axis, state.offset, state.direction, state.load, state.spin)
         )
-        wrench = inertial_wrench(numbers, motion, state.steer_angle, twist, twist_dot)
+        wrench = inertial_wrench(numbers, motion, state.direction, twist, twist_dot)
         if leaning is not None:
             wrench[:, :2] -= numbers.total_mass * derivative(derivative(leaning, motion.rate), motion.rate)
         predicted.append(wrench)
@@ -726,7 +785,7 @@ def channel_sides(
         if numbers.imu_lean.any():
             # A sensor that leans feels a part of its weight.
             leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
-            sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, state.steer_angle)
+            sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, state.direction)
         predicted.append(sensed)
     if layout.pose:
         late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0

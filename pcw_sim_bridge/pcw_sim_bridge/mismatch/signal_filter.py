@@ -13,6 +13,8 @@ import functools
 import numpy as np
 from scipy import interpolate, signal, sparse
 
+from pcw_description.compiled import compiled
+
 from .regression_problem import FloatArray
 
 FILTER_ORDER = 4
@@ -102,15 +104,31 @@ def _decimation(own: SignalFilter, length: int) -> sparse.csr_array:
 def derivative(values: FloatArray, rate: float) -> FloatArray:
     """First derivative of a smooth signal along its first axis, (T, ...) -> (T, ...)."""
     if len(values) < 2 * len(_STENCIL):
-        return np.gradient(values, 1.0 / rate, axis=0)
-    result: FloatArray = np.gradient(values, 1.0 / rate, axis=0)
-    half = len(_STENCIL) // 2
-    inner = sum(
-        weight * values[index : len(values) - 2 * half + index]
-        for index, weight in enumerate(_STENCIL)
-        if weight != 0.0
-    )
-    result[half:-half] = np.asarray(inner) * rate
+        return np.asarray(np.gradient(values, 1.0 / rate, axis=0))
+    flat = np.ascontiguousarray(values, dtype=np.float64).reshape(len(values), -1)
+    result: FloatArray = _derivative(flat, rate, _STENCIL).reshape(np.shape(values))
+    return result
+
+
+@compiled
+def _derivative(values, rate, stencil):  # type: ignore[no-untyped-def]
+    """Derivative (T, K), of lower order where the stencil does not fit."""
+    result = np.empty_like(values)
+    count, half = len(values), len(stencil) // 2
+    step = 1.0 / rate
+    for t in range(count):
+        if half <= t < count - half:
+            result[t] = 0.0
+            for index in range(len(stencil)):
+                if index != half:
+                    for k in range(values.shape[1]):
+                        result[t, k] += stencil[index] * values[t - half + index, k]
+            for k in range(values.shape[1]):
+                result[t, k] *= rate
+        else:
+            before, after = max(t - 1, 0), min(t + 1, count - 1)
+            for k in range(values.shape[1]):
+                result[t, k] = (values[after, k] - values[before, k]) / ((after - before) * step)
     return result
 
 

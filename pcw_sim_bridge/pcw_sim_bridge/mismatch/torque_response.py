@@ -10,7 +10,6 @@ D being the time derivative and T the tyre's damping time. Thousands of torques 
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import DAMPING_TIME, LENGTH
@@ -51,14 +50,8 @@ class TorqueResponse:
         of_torque[:, :, 0, DRIVE] = 1.0 / numbers.radius
         of_torque[:, :, 1, DRIVE] = offset_y / offset_x / numbers.radius
         of_torque[:, :, 1, STEER] = -1.0 / offset_x
-        slopes = numbers.softness[:, :, None] * straight.of_force
-        self._ratio_of_torque = slopes @ of_torque
-        self._derivative = _derivative_matrix(count, motion.rate)
-        damped = sparse.eye_array(count) - DAMPING_TIME * self._derivative
-        relaxing = self._derivative @ damped
-        self._slip_of_ratio = [
-            (sparse.diags_array(state.speed[:, i]) @ damped + numbers.tyres[i, LENGTH] * relaxing).tocsr() for i in range(n)
-        ]
+        self._ratio_of_torque = (numbers.softness[:, :, None] * straight.of_force) @ of_torque
+        self._rate, self._speed, self._length = motion.rate, state.speed[:, :, None, None], numbers.tyres[:n, LENGTH]
         jacobian, self._rigid = _rigid_maps(numbers.steer_axis, state.offset, steer_angle)
         wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
         self._wrench_of_torque = np.einsum("tcnf,tnfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
@@ -69,16 +62,16 @@ class TorqueResponse:
         """Return what torques (T, n, 2, K) [N m] change in measured minus predicted channels (T, C, K)."""
         count, n, _, width = torque.shape
         layout = self.layout
-        ratio = self._ratio_of_torque @ torque
-        slip = np.empty((count, n, 2, width))
-        for i, operator in enumerate(self._slip_of_ratio):
-            slip[:, i] = (operator @ ratio[:, i].reshape(count, -1)).reshape(count, 2, width)
-        rigid = self._rigid @ slip.reshape(count, 2 * n, width)
+        torque = np.ascontiguousarray(torque)
+        ratio = _products(self._ratio_of_torque.reshape(-1, 2, 2), torque.reshape(-1, 2, width)).reshape(torque.shape)
+        ratio -= DAMPING_TIME * derivative(ratio, self._rate)
+        slip = self._speed * ratio + self._length[:, None, None] * derivative(ratio, self._rate)
+        rigid = _products(self._rigid, slip.reshape(count, 2 * n, width))
         twist, contradiction = -rigid[:, :3], rigid[:, 3:]
-        twist_dot = (self._derivative @ twist.reshape(count, -1)).reshape(twist.shape)
+        twist_dot = derivative(twist, self._rate)
         found = np.empty((count, layout.tracked.stop, width))
-        found[:, :3] = self._wrench_of_torque @ torque.reshape(count, 2 * n, width)
-        found[:, :3] -= self._inertia @ twist_dot + self._turning @ twist
+        found[:, :3] = _products(self._wrench_of_torque, torque.reshape(count, 2 * n, width))
+        found[:, :3] -= _products(self._inertia, twist_dot) + _products(self._turning, twist)
         found[:, layout.consistency] = -contradiction
         if layout.imu:
             (x, y), omega = self._imu_position, self._twist[:, 2, None]
@@ -97,23 +90,16 @@ class TorqueResponse:
         return found
 
 
-def _derivative_matrix(count: int, rate: float) -> sparse.csr_array:
-    """The derivative of `signal_filter` as a matrix (T, T)."""
-    band = min(count, 32)
-    small = derivative(np.eye(band), rate)
-    if count <= band:
-        return sparse.csr_array(small)
-    half = band // 2
-    inner = small[half]
-    reach = np.flatnonzero(inner)
-    offsets = reach - half
-    matrix = sparse.diags_array(
-        [np.full(count - abs(o), inner[r]) for o, r in zip(offsets, reach, strict=True)], offsets=offsets, shape=(count, count)
-    ).tolil()
-    edge = band // 4
-    matrix[:edge, :band] = small[:edge]
-    matrix[count - edge :, count - band :] = small[band - edge :]
-    return matrix.tocsr()
+@compiled
+def _products(matrices, vectors):  # type: ignore[no-untyped-def]
+    """Matrices (T, A, B) times vectors (T, B, K), (T, A, K): for matrices as small as these BLAS is slow."""
+    found = np.zeros((matrices.shape[0], matrices.shape[1], vectors.shape[2]))
+    for t in range(matrices.shape[0]):
+        for a in range(matrices.shape[1]):
+            for b in range(matrices.shape[2]):
+                for k in range(vectors.shape[2]):
+                    found[t, a, k] += matrices[t, a, b] * vectors[t, b, k]
+    return found
 
 
 @compiled
@@ -138,13 +124,13 @@ def _rigid_maps(steer_axis, offset, steer_angle):  # type: ignore[no-untyped-def
 
 def _inertia_slopes(numbers: ModelNumbers, motion: RobotMotion, state: RollingState) -> tuple[FloatArray, FloatArray]:
     """Slopes of the inertial wrench over the twist's derivative and over the twist, (T, 3, 3) each."""
-    steer_angle, twist, twist_dot = state.steer_angle, state.twist, state.twist_dot
-    plain = inertial_wrench(numbers, motion, steer_angle, twist, twist_dot)
+    direction, twist, twist_dot = state.direction, state.twist, state.twist_dot
+    plain = inertial_wrench(numbers, motion, direction, twist, twist_dot)
     inertia, turning = np.empty((len(twist), 3, 3)), np.empty((len(twist), 3, 3))
     step = 1e-3
     for k in range(3):
         change = np.zeros(3)
         change[k] = step
-        inertia[:, :, k] = (inertial_wrench(numbers, motion, steer_angle, twist, twist_dot + change) - plain) / step
-        turning[:, :, k] = (inertial_wrench(numbers, motion, steer_angle, twist + change, twist_dot) - plain) / step
+        inertia[:, :, k] = (inertial_wrench(numbers, motion, direction, twist, twist_dot + change) - plain) / step
+        turning[:, :, k] = (inertial_wrench(numbers, motion, direction, twist + change, twist_dot) - plain) / step
     return inertia, turning

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, special, stats
 
+from .all_cores import on_all_cores
 from .column_bank import ColumnBank
 from .noise_model import NoiseModel
 from .regression_problem import FloatArray, IntArray, RegressionProblem, Shape
@@ -175,7 +177,7 @@ class WhitenedRegression:
         bounds = [0, *edges.tolist(), self.rows]
         self.blocks = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
         self._bank = ColumnBank(self.blocks, self.rows)
-        self._base = self._bank.add(np.concatenate([self.nuisance, self.target[:, None]], axis=1))
+        self._base = slice(self._bank.add(self.nuisance).start, self._bank.add(self.target[:, None]).stop)
         self._places: dict[tuple[int, Frozen], slice] = {}
         self._long_scans: dict[int, tuple[npt.NDArray[np.float32], FloatArray]] = {}
         self._short_scans: list[_ScanGroup] | None = None
@@ -183,9 +185,8 @@ class WhitenedRegression:
 
     def _rows(self, values: FloatArray) -> FloatArray:
         """Whiten (T, C) or (T, C, K), keep usable rows, apply root weights -> (R,) or (R, K)."""
-        white = self.noise.whiten(values, self.problem.valid, self.problem.segment)
-        flat = white.reshape(-1, *values.shape[2:])[self._flat]
-        return flat * self._root.reshape(-1, *(1,) * (flat.ndim - 1))
+        rows = self.noise.whitened_rows(values, self.problem.valid, self.problem.segment, self._flat, self._root)
+        return rows if values.ndim > 2 else rows[:, 0]
 
     def moved(self, problem: RegressionProblem) -> WhitenedRegression:
         """Whiten the same problem, exact elsewhere, by the same noise."""
@@ -251,7 +252,7 @@ class WhitenedRegression:
         known = {key: self._tried[key] for key in keys if key in self._tried}
         new = [key for key in dict.fromkeys(keys) if key not in known and key not in self._places]
         if new:
-            raw = [self.problem.tried_columns(*key) for key in new]
+            raw = on_all_cores(lambda key: self.problem.tried_columns(*key), new)
             edges = np.cumsum([columns.shape[2] for columns in raw])[:-1]
             known |= zip(new, np.split(self._rows(np.concatenate(raw, axis=2)), edges, axis=1), strict=True)
         for key in known:
@@ -402,7 +403,9 @@ class WhitenedRegression:
             ]
             missing = [key for key in wanted if key not in self._places]
             if missing:
-                raw = [problem.columns(*key) for key in missing]
+                # Shapes of one term may share what they are put together from: one after the other.
+                by_term = [list(keys) for _, keys in itertools.groupby(missing, key=lambda key: key[0])]
+                raw = sum(on_all_cores(lambda keys: [problem.columns(*key) for key in keys], by_term), [])
                 place = self._bank.add(self._rows(np.concatenate(raw, axis=2))).start
                 for key, columns in zip(missing, raw, strict=True):
                     self._places[key] = slice(place, place + columns.shape[2])
@@ -510,21 +513,23 @@ class WhitenedRegression:
     ) -> None:
         """Add the best shape of every term to the results, with its gain marginal over the shapes; gains (keys, N)."""
         terms = np.array([index for index, _ in keys])
-        starts = np.flatnonzero(np.r_[True, np.diff(terms) != 0]).tolist()
-        for start, stop in zip(starts, [*starts[1:], len(terms)], strict=True):
-            gain = gains[start:stop]
-            best = np.argmax(gain, axis=0)
-            top = gain[best, np.arange(gain.shape[1])]
-            index = int(terms[start])
+        starts = np.flatnonzero(np.r_[True, np.diff(terms) != 0])
+        counts = np.diff([*starts, len(terms)])
+        top = np.maximum.reduceat(gains, starts, axis=0)
+        order = np.arange(len(terms))[:, None]
+        best = np.minimum.reduceat(np.where(gains == np.repeat(top, counts, axis=0), order, len(terms)), starts, axis=0)
+        # A grid that was narrowed down beforehand is paid for as the whole that it was chosen from.
+        whole = [max(self.problem.terms[index].grid_size, count) for index, count in zip(terms[starts], counts, strict=True)]
+        with np.errstate(invalid="ignore", over="ignore"):
+            shares = np.add.reduceat(np.exp(gains - np.repeat(top, counts, axis=0)), starts, axis=0)
+            marginal = top + np.log(shares) - np.log(whole)[:, None]
+        for row, index in enumerate(terms[starts].tolist()):
             base = self.problem.terms[index].base_indices()
-            # A grid that was narrowed down beforehand is paid for as the whole that it was chosen from.
-            paid = math.log(max(self.problem.terms[index].grid_size, stop - start))
-            with np.errstate(invalid="ignore", over="ignore"):
-                marginal = top + np.log(np.sum(np.exp(gain - top), axis=0)) - paid
-            for n in range(gain.shape[1]):
-                finite = bool(np.isfinite(top[n]))
-                value, occam = (float(marginal[n]), float(top[n] - marginal[n])) if finite else (-np.inf, 0.0)
-                results[n].append(Candidate(Instance(index, keys[start + int(best[n])][1], base, occam), value))
+            for n, result in enumerate(results):
+                finite = bool(np.isfinite(top[row, n]))
+                value = float(marginal[row, n]) if finite else -np.inf
+                occam = float(top[row, n] - marginal[row, n]) if finite else 0.0
+                result.append(Candidate(Instance(index, keys[int(best[row, n])][1], base, occam), value))
 
     def within_bounds(self, fit: Fit) -> bool:
         """Whether every parameter of a fit lies within its bounds."""

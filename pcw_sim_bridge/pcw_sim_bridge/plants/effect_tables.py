@@ -47,6 +47,17 @@ if COMPILES:
 
     structref.define_proxy(CompiledTables, _TablesType, list(FIELDS))
 
+    # Numba's own constructor is compiled anew in every process; this one comes from the cache.
+    @compiled
+    def _compiled_tables(  # type: ignore[no-untyped-def]
+        joint_kernels, joint_start, joint_place, joint_numbers, array_kernels, array_start, array_numbers,
+        memory_start, memory, gears, coupling, gear_state,
+    ):  # fmt: skip
+        return CompiledTables(
+            joint_kernels, joint_start, joint_place, joint_numbers, array_kernels, array_start, array_numbers,
+            memory_start, memory, gears, coupling, gear_state,
+        )  # fmt: skip
+
 Entry = tuple[Callable[..., None], FloatArray, int]
 
 
@@ -73,7 +84,7 @@ class EffectTables:
         self._collect_joint_torques(robot)
         self._collect_arrays(robot, dt)
         self._collect_gears(robot)
-        self.compiled = CompiledTables(*(getattr(self, name) for name in FIELDS)) if COMPILES else self
+        self.compiled = _compiled_tables(*(getattr(self, name) for name in FIELDS)) if COMPILES else self
         unit = np.array([0.0, 0.0, -1.0])
         for instance in robot.physics:
             effect = get(instance.name)
