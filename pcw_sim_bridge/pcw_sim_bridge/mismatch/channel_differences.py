@@ -34,19 +34,19 @@ class ChannelDifferences:
         self.model, self.motions, self.filters = model, motions, filters
         self._states: list[RollingState] = []
         self._around: list[Surroundings] = []
-        for motion in motions:
+        self.normal = [normal_along(motion, model.numbers) for motion in motions]
+        for motion, normal in zip(motions, self.normal, strict=True):
             around = model.around(motion)
             state = rolling_state(motion, model.numbers, model.layout, around)
             straight = StraightTyres.about(model.numbers, state.force, state.grip)
             self._states.append(state)
-            self._around.append(dataclasses.replace(around, straight=straight))
+            self._around.append(dataclasses.replace(around, straight=straight, normal=normal))
         self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
         self.known = [np.isfinite(measured) for measured, _ in self._sides]
         self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])
         self.predicted = self.filtered([predicted for _, predicted in self._sides])
         self.residual = self.measured - self.predicted
         self._responses: list[TorqueResponse] | None = None
-        self.normal = [normal_along(motion, model.numbers) for motion in motions]
 
     def filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         """Filter one array (T, ...) per motion and put them on end."""

@@ -32,12 +32,20 @@ class ColumnBank:
         """Add columns (R, m); return their places."""
         before, count = self._count, self._count + columns.shape[1]
         if count > len(self._data):
-            data = np.empty((max(count + ROOM, min(2 * before, before + 8 * ROOM)), self._data.shape[1]))
-            data[:before] = self._data[:before]
-            self._data = data
+            self._move(max(count + ROOM, min(2 * before, before + 8 * ROOM)))
         self._count = count
         self._data[before:count] = columns.T
         return slice(before, count)
+
+    def reserve(self, more: int) -> None:
+        """See to it that so many more columns fit without those that are there being moved again."""
+        if self._count + more > len(self._data):
+            self._move(self._count + more + ROOM)
+
+    def _move(self, room: int) -> None:
+        data = np.empty((room, self._data.shape[1]))
+        data[: self._count] = self._data[: self._count]
+        self._data = data
 
     def columns(self, places: IntArray) -> FloatArray:
         """Return columns (R, m) by their places."""

@@ -13,7 +13,6 @@ from scipy import stats
 
 from pcw_description.effect_instance import EffectInstance
 
-from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch
 from .explanation import HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
 from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
@@ -63,15 +62,10 @@ def command_findings(
     """
     others = {problem.channels[0].name: problem for problem in held_out}
     found = CommandFindings()
-    generators = [np.random.default_rng(seed) for _ in problems]
-
-    def explained(index: int) -> Explanation | None:
-        problem = problems[index]
-        return None if _is_idle(problem, settings) else explain(problem, generators[index], settings)
-
-    explanations = on_all_cores(explained, range(len(problems)))
-    for problem, rng, explanation in zip(problems, generators, explanations, strict=True):
+    for problem in problems:
+        rng = np.random.default_rng(seed)
         channel = problem.channels[0]
+        explanation = None if _is_idle(problem, settings) else explain(problem, rng, settings)
         added, floor = np.zeros_like(problem.residual), _size(problem.residual)
         flagged = False
         if explanation is not None:

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
@@ -112,9 +113,10 @@ class LawSearch:
         if not trials:
             return None
         # All are judged under the noise that the best of them leaves: under that of a worse one it is "slow noise".
-        residual = self._left_by(max(trials, key=self._plain_evidence))
-        trials = [self._pruned(residual, trial) for trial in trials]
-        fits = [trial.search.whiten_at(residual).fit(trial.instances) for trial in trials]
+        evidences = on_all_cores(self._plain_evidence, trials)
+        residual = self._left_by(trials[int(np.argmax(evidences))])
+        trials = on_all_cores(lambda trial: self._pruned(residual, trial), trials)
+        fits = on_all_cores(lambda trial: trial.search.whiten_at(residual).fit(trial.instances), trials)
         order = np.argsort([-fit.log_evidence for fit in fits])
         best = next((trials[k] for k in order if not self._undoes_a_motor(trials[k].law, fits[k])), None)
         return None if best is None else self._judged(best)

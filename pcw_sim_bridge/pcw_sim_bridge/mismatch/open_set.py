@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
 from .law_search import FoundLaw, LawSearch
 from .leftover_expression import ClosedForm, closed_form, fourier, written
@@ -343,11 +344,10 @@ class OpenSetTest:
 
     def run(self, threshold: float) -> OpenSetResult:
         """Find the leading dependence of every channel, and the names that do not survive it."""
-        leftovers = []
-        for channel in range(len(self.problem.channels)):
-            best = self._leading(channel, self.instances, threshold)
-            if best is not None:
-                leftovers.append(best)
+        channels = range(len(self.problem.channels))
+        self.regression.grams(self.instances)  # found once, before all channels ask for it at the same time
+        leading = on_all_cores(lambda channel: self._leading(channel, self.instances, threshold), channels)
+        leftovers = [best for best in leading if best is not None]
         leftovers.sort(key=lambda leftover: -leftover.gain)
         vetoed = self._vetoes(leftovers, threshold)
         floor = np.array(
@@ -455,9 +455,6 @@ class AugmentedFit:
         problem = regression.problem
         self.columns = np.zeros((*problem.residual.shape, functions.shape[1]))
         self.columns[:, channel] = functions
-        self.design = np.concatenate(
-            [regression.design(self.instances), regression.whiten_columns(self.columns)], axis=1
-        )
         valid = problem.valid[:, channel]
         size = float(np.sqrt(np.mean(problem.residual[valid, channel] ** 2))) if valid.any() else 1.0
         spread = np.maximum(np.sqrt(np.mean(functions**2, axis=0)), 1e-300)
@@ -466,9 +463,27 @@ class AugmentedFit:
 
     @functools.cached_property
     def _grams(self) -> FloatArray:
-        """Gram matrices of set, function and target by block."""
-        stacked = np.concatenate([self.design, self.regression.target[:, None]], axis=1)
-        return np.stack([stacked[piece].T @ stacked[piece] for piece in self.regression.blocks])
+        """Gram matrices of set, function and target by block; that of set and target is known to the regression."""
+        regression = self.regression
+        known = regression.grams(self.instances)
+        set_size = known.shape[1] - 1
+        own = np.arange(set_size, set_size + self.own)
+        rest = np.r_[np.arange(set_size), set_size + self.own]
+        beside = np.concatenate([regression.design(self.instances), regression.target[:, None]], axis=1)
+        white = regression.whiten_columns(self.columns)
+        grams = np.empty((len(known), len(rest) + self.own, len(rest) + self.own))
+        grams[:, rest[:, None], rest] = known
+        for gram, piece in zip(grams, regression.blocks, strict=True):
+            cross = beside[piece].T @ white[piece]
+            gram[rest[:, None], own], gram[own[:, None], rest] = cross, cross.T
+            gram[own[:, None], own] = white[piece].T @ white[piece]
+        return grams
+
+    @functools.cached_property
+    def _held_out_means(self) -> FloatArray:
+        """Numbers of set and function (blocks, k) by all other blocks."""
+        total = self._grams.sum(axis=0)
+        return np.stack([self._posterior(total - gram, len(self.deviations)) for gram in self._grams])
 
     def _posterior(self, gram: FloatArray, count: int) -> FloatArray:
         precision = gram[:count, :count] + np.diag(1.0 / self.deviations[:count] ** 2)
@@ -480,9 +495,9 @@ class AugmentedFit:
         total = grams.sum(axis=0)
         base = len(self.deviations) - self.own
         errors = [0.0, 0.0]
-        for gram in grams:
-            for which, count in enumerate((base, len(self.deviations))):
-                mean = self._posterior(total - gram, count)
+        for gram, everything in zip(grams, self._held_out_means, strict=True):
+            for which, mean in enumerate((self._posterior(total - gram, base), everything)):
+                count = len(mean)
                 keep = np.r_[np.arange(count), gram.shape[0] - 1]
                 extended = np.append(-mean, 1.0)
                 errors[which] += float(extended @ gram[np.ix_(keep, keep)] @ extended)
@@ -490,17 +505,15 @@ class AugmentedFit:
 
     def held_out_residuals(self, problem: RegressionProblem, block: IntArray, channel: int) -> FloatArray:
         """Residual of the channel in its own unit (T,), every block predicted from the others."""
-        grams = self._grams
-        total = grams.sum(axis=0)
-        parts = [problem.nuisance_columns()]
+        parts = [problem.nuisance_columns()[:, channel]]
         for instance in self.instances:
-            parts.append(problem.columns(instance.term, instance.shape)[..., list(instance.active)])
-        plain = np.concatenate([*parts, self.columns], axis=2)[:, channel]
+            parts.append(problem.columns(instance.term, instance.shape)[:, channel, list(instance.active)])
+        plain = np.concatenate([*parts, self.columns[:, channel]], axis=1)
         residual = problem.residual[:, channel].copy()
         used = self.regression.block_labels()
-        for label, gram in zip(used, grams, strict=True):
+        for label, mean in zip(used, self._held_out_means, strict=True):
             rows = block == label
-            residual[rows] -= plain[rows] @ self._posterior(total - gram, len(self.deviations))
+            residual[rows] -= plain[rows] @ mean
         return residual
 
     def weights(self) -> FloatArray:

@@ -238,7 +238,7 @@ class ChannelModel:
             return around
         shape = motion.position.shape
         torque = np.zeros(shape) if around.torque is None else around.torque.copy()
-        normal = normal_along(motion, self.numbers)
+        normal = normal_along(motion, self.numbers) if around.normal is None else around.normal
         if isinstance(effect, JointTorqueEffect):
             axis = AXIS_NAMES.index(instance.axis or effect.axis)
             for name in instance.target:

@@ -178,6 +178,7 @@ class Surroundings:
         climb: force of sloping ground through each wheel's centre, in the wheel frames (T, n, 2) [N].
         pull: of gravity along base_link's axes (T, 2) [m/s^2].
         straight: the tyres' curves straightened about where they are without a small change; None: the curves themselves.
+        normal: loads of the wheels along the motion, on level ground (T, n) [N]; None: to be found when they are needed.
     """
 
     torque: FloatArray | None = None
@@ -187,6 +188,7 @@ class Surroundings:
     climb: FloatArray | None = None
     pull: FloatArray | None = None
     straight: StraightTyres | None = None
+    normal: FloatArray | None = None
 
 
 NOTHING = Surroundings()

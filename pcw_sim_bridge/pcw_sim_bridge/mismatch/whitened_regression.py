@@ -34,6 +34,7 @@ RETUNED_SHARE = 0.05
 # By so much more may a size come out to first order than there can be: numbers beside it multiply it.
 CURVED_ROOM = 2.0
 TRIED_BYTES = 2**26  # of columns of shapes that were only tried
+TOGETHER = 40  # shapes whose columns are whitened in one go
 Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 
 
@@ -406,7 +407,10 @@ class WhitenedRegression:
                 # Shapes of one term may share what they are put together from: one after the other.
                 by_term = [list(keys) for _, keys in itertools.groupby(missing, key=lambda key: key[0])]
                 raw = sum(on_all_cores(lambda keys: [problem.columns(*key) for key in keys], by_term), [])
-                place = self._bank.add(self._rows(np.concatenate(raw, axis=2))).start
+                self._bank.reserve(sum(columns.shape[2] for columns in raw))
+                pieces = [raw[k : k + TOGETHER] for k in range(0, len(raw), TOGETHER)]
+                whitened = on_all_cores(lambda some: self._rows(np.concatenate(some, axis=2)), pieces)
+                place = min(self._bank.add(columns).start for columns in whitened)
                 for key, columns in zip(missing, raw, strict=True):
                     self._places[key] = slice(place, place + columns.shape[2])
                     place += columns.shape[2]
