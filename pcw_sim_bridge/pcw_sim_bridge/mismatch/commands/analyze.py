@@ -53,10 +53,13 @@ def remapped_topics(remaps: Sequence[str]) -> dict[str, str]:
 
 def run(options: argparse.Namespace) -> int:
     """Analyse, write the report, print its path and five lines."""
+    from pcw_description.one_thread import one_thread
+
     from ..analysis import analyse
     from ..load_subject import load_subject
     from ..report import check_output, write_report
 
+    one_thread()  # the analysis has its own, see `all_cores`: those of linear algebra would take turns with them, and spin
     topics = remapped_topics(options.topic)
     for path in (*options.recordings, *options.holdout):
         if not path.exists():
