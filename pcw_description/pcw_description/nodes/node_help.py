@@ -19,7 +19,7 @@ from rclpy.lifecycle import LifecycleNodeMixin
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from .node_tools import AllDeclared, DeclaredParameter, sketch, type_name
+from .node_parameters import AllDeclared, DeclaredParameter, sketch, type_name
 
 NARROWEST, WIDEST = 60, 128  # [characters]
 HOW_TO_GIVE = """\
