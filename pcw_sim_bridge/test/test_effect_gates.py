@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pcw_sim_bridge.mismatch.effect_gates import (
-    BEYOND_SCALE,
     COMMON_FACTOR,
     NOISY_FACTOR,
     NOISY_PART,
@@ -39,21 +38,6 @@ def test_gears_of_all_casters_stand_out_from_what_a_chassis_does_to_all_wheels(n
     assert gates._noise_factor(instances) == factor
     least = {"friction": SelectionSettings().smallest_share, "gear of one": NOISY_PART, "gears of all": 1.0}
     assert [gates._least(instance) for instance in instances] == [least[name] for name in named]
-
-
-@pytest.mark.parametrize(
-    ("times", "curved", "beyond"),
-    [(0.9 * BEYOND_SCALE, False, False), (1.1 * BEYOND_SCALE, False, True), (1.1 * BEYOND_SCALE, True, False)],
-)
-def test_half_a_torque_is_no_error_of_the_models_scale(times: float, curved: bool, beyond: bool) -> None:
-    """However little of it is left beside a friction that takes most of it back; of one per cent nobody can say so."""
-    measured = np.array([[3.0, 0.0], [-3.0, 0.0]])
-    problem = SimpleNamespace(
-        terms=[SimpleNamespace(is_curved=curved)], scale_deviation=0.01, measured=measured, valid=np.ones((2, 2), dtype=bool)
-    )
-    gates = EffectGates(problem, SelectionSettings())
-    own = np.array([times * 0.01 * 3.0, 1.0])  # nothing is measured in the second channel, and nothing is told by it
-    assert gates._beyond_scale([SimpleNamespace(term=0)], own) == beyond
 
 
 @pytest.mark.parametrize(

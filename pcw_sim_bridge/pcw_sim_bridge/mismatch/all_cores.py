@@ -26,7 +26,7 @@ def on_all_cores(work: Callable[[Item], Result], items: Sequence[Item]) -> list[
         return list(pool.map(work, items))
 
 
-def beside(work: Callable[[], Result], other: Callable[[], Other]) -> tuple[Result, Other]:
+def side_by_side(work: Callable[[], Result], other: Callable[[], Other]) -> tuple[Result, Other]:
     """Return what two pieces of work make that have nothing to do with each other; interrupts reach the first at once."""
     if _cores() < 2:
         return work(), other()

@@ -14,7 +14,7 @@ import numpy as np
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects, also_known, get
 
-from .all_cores import beside
+from .all_cores import side_by_side
 from .command_findings import CommandFindings, command_findings
 from .explanation import Explanation, NamedTerm, explain, explanation_by
 from .findings import (
@@ -117,7 +117,7 @@ def analyse(
         prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
         return command_findings(fitted, others, seed, settings, progress), prover
 
-    explanation, (commands, prover) = beside(
+    explanation, (commands, prover) = side_by_side(
         lambda: explain(problem, np.random.default_rng(seed), settings, progress), needs_no_explanation
     )
     progress("proving it on held-out data")

@@ -18,8 +18,6 @@ ABOVE_BURSTS = 3.0
 NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
 # Such an effect must do this part of what remains in some channel, and all of it where it is on all casters, as noise is.
 NOISY_PART = 0.75
-# An effect that by itself is so many deviations of the model's scale is no wrong scale, though others undo most of it.
-BEYOND_SCALE = 20.0
 
 
 class EffectGates:
@@ -74,7 +72,7 @@ class EffectGates:
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
             floors = remains, self.settings.smallest_part * total
-            share = self._share(regression, [instance], changes[index], sizes, floors, own[index])
+            share = self._share(regression, [instance], changes[index], sizes, floors)
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
             needed = retunings[index] / self.settings.smallest_threshold
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
@@ -130,12 +128,11 @@ class EffectGates:
         change: FloatArray,
         sizes: FloatArray,
         floors: tuple[FloatArray, FloatArray],
-        own: FloatArray | None = None,
     ) -> float:
         """Contribution of some instances, a change (T, C) of sizes (C,), against the smallest that counts.
 
         That is what the model itself misjudges, unless the change does not look like it; and in any case a part of what
-        remains, the first of the floors (C,), and the second one. `own` is what a single one does by itself (C,).
+        remains, the first of the floors (C,), and the second one.
         """
         remains, part = floors
         least = max(self._least(instance) for instance in instances)
@@ -146,8 +143,6 @@ class EffectGates:
             return share
         if all(self._at_joints(instance) for instance in instances):
             wanted = self.settings.least_peculiar_torque
-        elif own is not None and self._beyond_scale(instances, own):
-            wanted = self.settings.least_peculiar
         else:
             wanted = self.settings.least_peculiar * self._noise_factor(instances)
         return max(share, min(seen, regression.peculiar(change) / wanted))
@@ -156,12 +151,6 @@ class EffectGates:
         """Whether an effect of the library adds torques to joints, in proportion to its numbers."""
         term = self.problem.terms[instance.term]
         return term.is_exact and not term.is_curved and term.effect != UNKNOWN
-
-    def _beyond_scale(self, instances: Sequence[Instance], own: FloatArray) -> bool:
-        """Whether what is in proportion to something measured is more than any error of its scale, by itself (C,)."""
-        curved = any(self.problem.terms[instance.term].is_curved for instance in instances)
-        scale = self.problem.scale_deviation * self._sizes(self.problem.measured)
-        return not curved and bool(np.any((scale > 0.0) & (own > BEYOND_SCALE * scale)))
 
     def _least(self, instance: Instance) -> float:
         """Part of what remains in some channel that a term must do at least.
