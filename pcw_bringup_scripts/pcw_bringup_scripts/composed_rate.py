@@ -35,6 +35,7 @@ DEFAULT_NODES = ("bridge", "computed_torque", "odometry", "slip_observer", "terr
 THINNED = ("encoder_slip", "imu_slip", "odometry", "slip_fusion", "slip_observer", "terrain")
 TYPES = {"odom": Odometry}  # of topics; JointState otherwise
 TWIST = (0.3, 0.0, 0.3)  # what the robot drives [m/s, m/s, rad/s]
+FIRST_START = 300.0  # a new installation compiles before it answers [s]
 SETTLED = 3.0  # before anything is counted [s]
 
 
@@ -73,7 +74,7 @@ def measure(nodes: Sequence[str], topic: str, robot: str, duration: float) -> st
         cmd_vel = ros.peer.create_publisher(TwistStamped, "cmd_vel", 1)
         command = TwistStamped()
         command.twist.linear.x, command.twist.linear.y, command.twist.angular.z = TWIST
-        ros.wait_for(lambda: answered.at, while_doing=lambda: cmd_vel.publish(command), every=0.05)
+        ros.wait_for(lambda: answered.at, FIRST_START, while_doing=lambda: cmd_vel.publish(command), every=0.05)
         ros.spin_for(SETTLED, lambda: cmd_vel.publish(command), every=0.05)
         first, started, spent = max(asked.at), time.perf_counter(), cpu_time(process.process.pid)
         ros.spin_for(duration, lambda: cmd_vel.publish(command), every=0.05)

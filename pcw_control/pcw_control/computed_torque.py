@@ -46,6 +46,7 @@ from .controller_interface import (
     check_step,
     output_kernel,
     parameter,
+    replaced,
 )
 from .delay_margin import BANDWIDTH, DELAY, derived_bandwidth
 from .errors import ControlError
@@ -111,7 +112,6 @@ class Demand(NamedTuple):
         A: wheel Jacobian (2n, 3).
         normal_inverse: (A^T A)^-1 (3, 3).
         inertia, bias: Lambda (3, 3) and theta (3,).
-        incompatibility: (I - A A^+) B q_dot (n, 2) [m/s], the part of the slip that encoders see.
     """
 
     wrench: FloatArray
@@ -121,7 +121,6 @@ class Demand(NamedTuple):
     normal_inverse: FloatArray
     inertia: FloatArray
     bias: FloatArray
-    incompatibility: FloatArray
 
 
 class ComputedTorque:
@@ -146,7 +145,10 @@ class ComputedTorque:
         self._B_inverse: FloatArray = np.linalg.inv(self._B).astype(np.float64)
         self._reference_motion = ReferenceMotion(robot, self.parameters)
         gain = self.parameters.integral_gain
-        self._largest_integral = np.array(self.parameters.integral_limit) / gain if gain > 0.0 else np.zeros(3)
+        largest = np.array(self.parameters.integral_limit) / gain if gain > 0.0 else np.zeros(3)
+        # What `approach_kernel` and `follow_twist_kernel` take first.
+        self._approach_numbers = (*self._geometry, self._radius, *self._reference_motion.numbers)
+        self._follow_numbers = (*self._model.numbers, largest, gain, self.parameters.velocity_gain)
 
     def initial_state(self, twist: FloatArray | None = None) -> ComputedTorqueState:
         """Return the state of a controller that takes over at a twist (3,), or at rest."""
@@ -177,7 +179,14 @@ class ComputedTorque:
     def _demand(
         self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
     ) -> tuple[ComputedTorqueState, Demand]:
-        """Return the operational force F that the reference asks for."""
+        """Return the state, and the operational force F that the reference asks for."""
+        V_d, e, demand = self._motion_demand(state, measurement, reference, dt)
+        return replaced(state, reference_twist=V_d, error_integral=e), demand
+
+    def _motion_demand(
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
+    ) -> tuple[FloatArray, FloatArray, Demand]:
+        """Return the twist that is followed (3,), the integral of its error (3,), and the operational force F."""
         if isinstance(reference, ForceReference):
             raise ControlError(
                 f"a ForceReference is not allowed for {type(self).__name__}; allowed: TwistReference, TrajectoryPoint"
@@ -186,27 +195,25 @@ class ComputedTorque:
         position = np.ascontiguousarray(measurement.joint_position, dtype=np.float64)
         velocity = np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64)
         if isinstance(reference, TwistReference):
-            steer_angle, A, V, incompatibility, normal_inverse, V_d, V_dot_d = _approach(
-                *self._geometry, self._radius, position, velocity, state.reference_twist, reference.twist, dt,
-                *self._reference_motion.numbers,
-            )  # fmt: skip
-            part = self._carried(V_d, V_dot_d, A, steer_angle, measurement)
-            V_d, e, inertia, bias, F = _follow_twist(
-                *self._model.numbers, steer_angle, V, state.reference_twist, V_d, V_dot_d, part, state.error_integral,
-                measurement.saturated, self._largest_integral, p.integral_gain, p.velocity_gain, dt,
-            )  # fmt: skip
-        else:
-            steer_angle, A, V, incompatibility, normal_inverse = kinematics_kernel(
-                *self._geometry, self._radius, position, velocity
-            )
-            V_d, inertia, bias, F = _follow_point(
-                *self._model.numbers, steer_angle, V, measurement.pose, reference.pose, reference.velocity,
-                reference.acceleration, p.position_gain, p.velocity_gain,
-            )  # fmt: skip
-            # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
-            e = np.zeros(3)
-        state = dataclasses.replace(state, reference_twist=V_d, error_integral=e)
-        return state, Demand(F, V, steer_angle, A, normal_inverse, inertia, bias, incompatibility)
+            return self._twist_demand(state, measurement, position, velocity, reference.twist, dt)
+        steer_angle, A, V, _, normal_inverse = kinematics_kernel(*self._geometry, self._radius, position, velocity)
+        V_d, inertia, bias, F = _follow_point(
+            *self._model.numbers, steer_angle, V, measurement.pose, reference.pose, reference.velocity,
+            reference.acceleration, p.position_gain, p.velocity_gain,
+        )  # fmt: skip
+        # The integral belongs to the other kind of reference; the twist is handed over for a smooth change to it.
+        return V_d, np.zeros(3), Demand(F, V, steer_angle, A, normal_inverse, inertia, bias)
+
+    def _twist_demand(
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, position: FloatArray, velocity: FloatArray,
+        target: FloatArray, dt: float,
+    ) -> tuple[FloatArray, FloatArray, Demand]:
+        """As `_motion_demand`, on the way to a twist (3,); of the ground all of the wanted change is asked."""
+        V_d, e, *demand = _follow_twist(
+            self._approach_numbers, self._follow_numbers, position, velocity, state.reference_twist, target,
+            state.error_integral, measurement.saturated, dt,
+        )  # fmt: skip
+        return V_d, e, Demand(*demand)
 
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
@@ -217,12 +224,6 @@ class ComputedTorque:
     def _output(self, state: ComputedTorqueState, demand: Demand, F_con: FloatArray) -> ControllerOutput:
         tau, internal = output_kernel(self._B, *self._geometry, demand.steer_angle, F_con)
         return ControllerOutput(tau, F_con, demand.wrench, demand.twist, state.reference_twist, internal)
-
-    def _carried(
-        self, V_d: FloatArray, V_dot_d: FloatArray, A: FloatArray, steer_angle: FloatArray, measurement: ControllerMeasurement
-    ) -> float:
-        """Return the part of the wanted change of the twist that the ground is asked for; here all of it."""
-        return 1.0
 
 
 @compiled
@@ -237,23 +238,35 @@ def kinematics_kernel(steer_axis, caster_offset, radius, position, velocity):  #
 
 
 @compiled
-def _approach(  # type: ignore[no-untyped-def]
-    steer_axis, caster_offset, radius, position, velocity, reference, target, dt, B_inverse, speed_limit, offset, numbers
-):
-    """As `kinematics_kernel`, and the next reference twist V_d (3,) and its derivative (3,) on the way to a target (3,)."""
-    steer_angle, A, V, incompatibility, normal_inverse = kinematics_kernel(
-        steer_axis, caster_offset, radius, position, velocity
-    )
-    V_d, V_dot_d = towards_kernel(reference, target, A, dt, B_inverse, speed_limit, offset, numbers)
-    return steer_angle, A, V, incompatibility, normal_inverse, V_d, V_dot_d
+def approach_kernel(numbers, position, velocity, reference, target, dt):  # type: ignore[no-untyped-def]
+    """Return V (3,), headings (n,), A (2n, 3), (A^T A)^-1 (3, 3), the next reference twist V_d (3,) and its derivative."""
+    steer_axis, caster_offset, radius, B_inverse, speed_limit, offset, limits = numbers
+    steer_angle, A, V, _, normal_inverse = kinematics_kernel(steer_axis, caster_offset, radius, position, velocity)
+    V_d, V_dot_d = towards_kernel(reference, target, A, dt, B_inverse, speed_limit, offset, limits)
+    return V, steer_angle, A, normal_inverse, V_d, V_dot_d
 
 
 @compiled
 def _follow_twist(  # type: ignore[no-untyped-def]
-    chassis, modules, steer_axis, caster_offset, steer_angle, V, before, V_d, V_dot_d, part, integral, hold, largest,
-    integral_gain, velocity_gain, dt,
+    approach, follow, position, velocity, reference, target, integral, hold, dt
 ):
-    """Return V_d, e (3,), Lambda, theta and F = Lambda (V_dot_d + k_p e + k_d e_dot) + theta for e_dot = V_d - V."""
+    """Return V_d, e and the fields of a `Demand` on the way to a target (3,)."""
+    V, steer_angle, A, normal_inverse, V_d, V_dot_d = approach_kernel(approach, position, velocity, reference, target, dt)
+    V_d, e, F, inertia, bias = follow_twist_kernel(
+        follow, steer_angle, V, reference, V_d, V_dot_d, 1.0, integral, hold, dt
+    )
+    return V_d, e, F, V, steer_angle, A, normal_inverse, inertia, bias
+
+
+@compiled
+def follow_twist_kernel(  # type: ignore[no-untyped-def]
+    numbers, steer_angle, V, before, V_d, V_dot_d, part, integral, hold, dt
+):
+    """Return V_d, e (3,), F = Lambda (V_dot_d + k_p e + k_d e_dot) + theta for e_dot = V_d - V, Lambda and theta.
+
+    The ground is asked for `part` of the change from the twist `before` to V_d.
+    """
+    chassis, modules, steer_axis, caster_offset, largest, integral_gain, velocity_gain = numbers
     wanted, e, V_dot = np.empty(3), integral.copy(), np.empty(3)
     for i in range(3):
         # Where the ground carries only a part of the change.
@@ -263,7 +276,7 @@ def _follow_twist(  # type: ignore[no-untyped-def]
             e[i] = min(max(integral[i] + e_dot * dt, -largest[i]), largest[i])
         V_dot[i] = min(part, 1.0) * V_dot_d[i] + integral_gain * e[i] + velocity_gain * e_dot
     inertia, bias = augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_angle, V)
-    return wanted, e, inertia, bias, _wrench(inertia, V_dot, bias)
+    return wanted, e, _wrench(inertia, V_dot, bias), inertia, bias
 
 
 @compiled

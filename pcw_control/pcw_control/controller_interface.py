@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar, Protocol, Self, TypeAlias
+from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from .errors import ControlError
 from .quintic_trajectory import TrajectoryPoint
 
 BoolArray = npt.NDArray[np.bool_]
+Instance = TypeVar("Instance")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +115,18 @@ class Controller(Protocol):
         self, state: Any, measurement: ControllerMeasurement, reference: Reference, dt: float
     ) -> tuple[Any, ControllerOutput]:
         """Compute the torques of one cycle."""
+
+
+def replaced(instance: Instance, **fields: Any) -> Instance:
+    """Return a copy of a state or an output with other values of some fields.
+
+    As `dataclasses.replace`, which takes three times as long because it looks at every field; a cycle makes several copies.
+    Not for a class that checks its fields when it is made.
+    """
+    copy = object.__new__(type(instance))
+    copy.__dict__.update(instance.__dict__)
+    copy.__dict__.update(fields)
+    return copy
 
 
 def parameter(
@@ -214,22 +227,25 @@ def check_step(measurement: ControllerMeasurement, reference: Reference, dt: flo
     if not (math.isfinite(dt) and dt > 0.0):
         raise ControlError(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
     # One call looks at all numbers; only where something is wrong is it looked for.
-    m, motion = measurement, reference.motion if isinstance(reference, ForceReference) else reference
-    wrench = reference.wrench if isinstance(reference, ForceReference) else _NOTHING
+    m, motion, wrench = measurement, reference, _ZERO
+    if isinstance(motion, ForceReference):
+        wrench, motion = motion.wrench, motion.motion
     if isinstance(motion, TwistReference):
-        last = (motion.twist, _NOTHING, _NOTHING, _NOTHING)
+        a, b, c, d = motion.twist, _ZERO, _ZERO, _ZERO
     else:
-        last = (m.pose, motion.pose, motion.velocity, motion.acceleration)
+        a, b, c, d = m.pose, motion.pose, motion.velocity, motion.acceleration
+    push = _ZERO if m.external_wrench is None else m.external_wrench
     if (
         m.joint_position.shape == m.joint_velocity.shape == (n, 2)
         and (m.slip is None or m.slip.shape == (n, 2))
-        and _have_length(n, m.friction, m.critical_slip, m.normal_force)
-        and _have_length(3, m.external_wrench, wrench, *last)
+        and (m.friction is None or m.friction.shape == (n,))
+        and (m.critical_slip is None or m.critical_slip.shape == (n,))
+        and (m.normal_force is None or m.normal_force.shape == (n,))
+        and push.shape == wrench.shape == a.shape == b.shape == c.shape == d.shape == (3,)
         and _all_finite(
             m.joint_position.ravel(), m.joint_velocity.ravel(), _NOTHING if m.slip is None else m.slip.ravel(),
             _NOTHING if m.friction is None else m.friction, _NOTHING if m.critical_slip is None else m.critical_slip,
-            _NOTHING if m.normal_force is None else m.normal_force,
-            _NOTHING if m.external_wrench is None else m.external_wrench, wrench, *last,
+            _NOTHING if m.normal_force is None else m.normal_force, push, wrench, a, b, c, d,
         )
     ):  # fmt: skip
         return
@@ -259,14 +275,8 @@ def _require(name: str, values: FloatArray, shape: Sequence[int]) -> None:
         raise ControlError(f"{name} = {values.tolist()} is not allowed; allowed: finite numbers, shape {tuple(shape)}")
 
 
-_NOTHING = np.zeros(0)
-
-
-def _have_length(length: int, *arrays: FloatArray | None) -> bool:
-    for values in arrays:
-        if values is not None and values is not _NOTHING and values.shape != (length,):
-            return False
-    return True
+# What stands for numbers that nobody gave.
+_NOTHING, _ZERO = np.zeros(0), np.zeros(3)
 
 
 @compiled

@@ -44,6 +44,7 @@ from .controller_interface import (
     choice,
     output_kernel,
     parameter,
+    replaced,
 )
 from .delay_margin import DELAY
 from .force_distribution import solve_kernel
@@ -58,6 +59,7 @@ FELT_SHARE = 1.0 / 3.0
 # A tripped force guard is released when the push falls below this part of its limit.
 RELEASED = 0.1
 _TANK, _STORED, _TRIPPED, _GUARD = range(4)
+_ZERO = np.zeros(3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,13 +161,16 @@ class UnifiedForceMotion(ComputedTorque):
         inertia = p.virtual_inertia or FELT_SHARE * own[2, 2]
         self.virtual_mass = np.array([mass, mass, inertia])
         self._follows = np.array(p.force_controlled)
-        self._speed_limit = robot.speed_limit * p.joint_speed_fraction
-        self._largest_change = p.force_limit / self.virtual_mass
-        self._numbers = np.array(
+        guards = np.array(
             [
                 p.coasting_time, p.force_integral, p.deadband, p.tank, p.force_limit, p.speed_limit, p.yaw_rate_limit,
                 p.power_limit,
             ]
+        )  # fmt: skip
+        # What `_guided_force` takes first.
+        self._guiding_numbers = (
+            self.virtual_mass, self._follows, p.force_limit / self.virtual_mass, p.tracking_gain, guards, self._B_inverse,
+            robot.speed_limit * p.joint_speed_fraction,
         )  # fmt: skip
 
     def initial_state(self, twist: FloatArray | None = None) -> Any:
@@ -180,26 +185,21 @@ class UnifiedForceMotion(ComputedTorque):
     def _demand(
         self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
     ) -> tuple[ComputedTorqueState, Demand]:
-        """Return F_u."""
-        motion = reference.motion if isinstance(reference, ForceReference) else reference
-        wanted = reference.wrench if isinstance(reference, ForceReference) else np.zeros(3)
+        """Return the state, and F_u."""
+        motion, wanted, push = reference, _ZERO, measurement.external_wrench
+        if isinstance(reference, ForceReference):
+            motion, wanted = reference.motion, reference.wrench
         before: Any = state
-        state, demand = super()._demand(state, measurement, motion, dt)
-        V, known = demand.twist, measurement.external_wrench is not None
-        push = measurement.external_wrench if measurement.external_wrench is not None else np.zeros(3)
-        V_f, impulse, energy = _give_way(
-            before.guided_twist, before.impulse, before.energy, push, wanted, V, known, self.virtual_mass, self._follows,
-            self._numbers, demand.A, self._B_inverse, self._speed_limit, dt,
+        V_d, e, demand = self._motion_demand(state, measurement, motion, dt)
+        F, V, steer_angle, A, normal_inverse, inertia, bias = demand
+        F_u, followed, V_f, impulse, energy = _guided_force(
+            self._guiding_numbers, before.guided_twist, before.impulse, before.energy, _ZERO if push is None else push,
+            wanted, push is not None, V_d, F, V, A, inertia, bias, dt,
         )  # fmt: skip
-        F_u, followed = _unified_force(
-            demand.wrench, demand.inertia, demand.bias, push, V, V_f, before.guided_twist, state.reference_twist,
-            self._follows, self._largest_change, self.parameters.tracking_gain, dt,
-        )  # fmt: skip
-        state = dataclasses.replace(
-            before, reference_twist=followed,
-            error_integral=state.error_integral, guided_twist=V_f, impulse=impulse, energy=energy,
-        )  # fmt: skip
-        return state, demand._replace(wrench=F_u)
+        state = replaced(
+            before, reference_twist=followed, error_integral=e, guided_twist=V_f, impulse=impulse, energy=energy
+        )
+        return state, Demand(F_u, V, steer_angle, A, normal_inverse, inertia, bias)
 
     def _output(self, state: ComputedTorqueState, demand: Demand, F_con: FloatArray) -> ForceGuidedOutput:
         guided: Any = state
@@ -218,6 +218,19 @@ class ForceGuided(SlipConstraintForce, UnifiedForceMotion):
 
     def __init__(self, robot: RobotDescription, parameters: ForceGuidedParameters | None = None) -> None:
         super().__init__(robot, parameters or ForceGuidedParameters.of_robot(robot))  # type: ignore[arg-type]
+
+
+@compiled
+def _guided_force(  # type: ignore[no-untyped-def]
+    numbers, before, impulse, energy, push, wanted, known, V_d, F, V, A, inertia, theta, dt
+):
+    """Return F_u (3,) and the twist that is followed (3,), and what `_give_way` does: one call in a control cycle."""
+    mass, follows, largest_change, gain, guards, B_inverse, joint_speed_limit = numbers
+    V_f, impulse, energy = _give_way(
+        before, impulse, energy, push, wanted, V, known, mass, follows, guards, A, B_inverse, joint_speed_limit, dt
+    )
+    F_u, followed = _unified_force(F, inertia, theta, push, V, V_f, before, V_d, follows, largest_change, gain, dt)
+    return F_u, followed, V_f, impulse, energy
 
 
 @compiled

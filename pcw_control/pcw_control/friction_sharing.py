@@ -33,7 +33,14 @@ from pcw_description.augmented_object_model import augmented_object_kernel
 from pcw_description.compiled import compiled
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 
-from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
+from .computed_torque import (
+    ComputedTorque,
+    ComputedTorqueParameters,
+    ComputedTorqueState,
+    Demand,
+    approach_kernel,
+    follow_twist_kernel,
+)
 from .controller_interface import ControllerMeasurement, parameter
 from .force_distribution import (
     LEAST_LIMIT,
@@ -104,31 +111,47 @@ class _OnGround(ComputedTorque):
         super().__init__(robot, parameters or FrictionParameters.of_robot(robot))
         self._loads = WheelLoads(robot)
 
-    def _carried(
-        self, V_d: FloatArray, V_dot_d: FloatArray, A: FloatArray, steer_angle: FloatArray, measurement: ControllerMeasurement
-    ) -> float:
-        """Return share / use where the wanted change needs more of the friction than the share, by the weighted forces."""
-        use: float = _use_of_change(
-            *self._model.numbers[:2], *self._loads.numbers, A, steer_angle, V_d, V_dot_d,
+    def _twist_demand(
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, position: FloatArray, velocity: FloatArray,
+        target: FloatArray, dt: float,
+    ) -> tuple[FloatArray, FloatArray, Demand]:
+        """As that of computed torque, but of the change no more is asked than what the share of the friction carries."""
+        V_d, e, *demand = _follow_twist_on_ground(
+            self._approach_numbers, self._follow_numbers, self._loads.numbers, position, velocity, state.reference_twist,
+            target, state.error_integral, measurement.saturated, dt, self.parameters.ground_share,
             *self._loads.known(measurement.friction, measurement.normal_force),
         )  # fmt: skip
-        return min(self.parameters.ground_share / max(use, 1e-12), 1.0)
+        return V_d, e, Demand(*demand)
 
     def _traction_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
         """Return mu F_z (n, 2) [N] at the acceleration that the demand asks for."""
         limit: FloatArray = _limit_of_demand(
-            *self._loads.numbers, demand.steer_angle, demand.inertia, demand.wrench,
+            self._loads.numbers, demand.steer_angle, demand.inertia, demand.wrench,
             *self._loads.known(measurement.friction, measurement.normal_force),
         )  # fmt: skip
         return limit
 
 
 @compiled
+def _follow_twist_on_ground(  # type: ignore[no-untyped-def]
+    approach, follow, loads, position, velocity, reference, target, integral, hold, dt, share, friction, normal_force
+):
+    """As `_follow_twist` of computed torque, with share / use of a change that needs more of the friction than the share."""
+    V, steer_angle, A, normal_inverse, V_d, V_dot_d = approach_kernel(approach, position, velocity, reference, target, dt)
+    use = _use_of_change(follow[0], follow[1], loads, A, steer_angle, V_d, V_dot_d, friction, normal_force)
+    part = min(share / max(use, 1e-12), 1.0)
+    V_d, e, F, inertia, bias = follow_twist_kernel(
+        follow, steer_angle, V, reference, V_d, V_dot_d, part, integral, hold, dt
+    )
+    return V_d, e, F, V, steer_angle, A, normal_inverse, inertia, bias
+
+
+@compiled
 def _use_of_change(  # type: ignore[no-untyped-def]
-    chassis, modules, load_chassis, load_module, steer_axis, caster_offset, mu, A, steer_angle, V, V_dot, friction,
-    normal_force,
+    chassis, modules, loads, A, steer_angle, V, V_dot, friction, normal_force
 ):
     """Return how much of the friction Lambda V_dot needs, by the weighted forces [1]."""
+    load_chassis, load_module, steer_axis, caster_offset, mu = loads
     inertia, _ = augmented_object_kernel(chassis, modules, steer_axis, caster_offset, steer_angle, V)
     wrench = np.zeros(3)
     for i in range(3):
@@ -142,9 +165,10 @@ def _use_of_change(  # type: ignore[no-untyped-def]
 
 @compiled
 def _limit_of_demand(  # type: ignore[no-untyped-def]
-    chassis, module, steer_axis, caster_offset, mu, steer_angle, inertia, wrench, friction, normal_force
+    loads, steer_angle, inertia, wrench, friction, normal_force
 ):
     """Return mu F_z (n, 2) at the acceleration Lambda^-1 F."""
+    chassis, module, steer_axis, caster_offset, mu = loads
     acceleration = solve_kernel(inertia, wrench)
     return traction_limit_kernel(
         chassis, module, steer_axis, caster_offset, mu, steer_angle, acceleration, friction, normal_force
@@ -207,15 +231,21 @@ class TractionLimitAvoidance(_OnGround):
         across = (robot.torque_limit[:, STEER] - offset[:, 1] * along) / offset[:, 0]
         self._torque_bound = np.stack([along, across], axis=1)
 
-    def force_limit(self, demand: Demand, measurement: ControllerMeasurement) -> FloatArray:
-        """Return a f_m (n, 2) [N]: a box within both the friction ellipse's axes and the torque limits."""
-        limit: FloatArray = _least_of(
-            self._traction_limit(demand, measurement), self._torque_bound, self.parameters.traction_share
-        )
-        return limit
-
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
     ) -> tuple[ComputedTorqueState, FloatArray]:
-        force, _ = limited_forces_kernel(demand.A, demand.wrench, self.force_limit(demand, measurement))
+        force: FloatArray = _forces_within_limits(
+            self._loads.numbers, self._torque_bound, self.parameters.traction_share, demand.A, demand.steer_angle,
+            demand.inertia, demand.wrench, *self._loads.known(measurement.friction, measurement.normal_force),
+        )  # fmt: skip
         return state, force
+
+
+@compiled
+def _forces_within_limits(  # type: ignore[no-untyped-def]
+    loads, bound, share, A, steer_angle, inertia, wrench, friction, normal_force
+):
+    """Return the least forces (n, 2) within a f_m, a box within both the friction ellipse's axes and the torque limits."""
+    limit = _limit_of_demand(loads, steer_angle, inertia, wrench, friction, normal_force)
+    force, _ = limited_forces_kernel(A, wrench, _least_of(limit, bound, share))
+    return force

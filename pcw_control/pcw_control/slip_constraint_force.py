@@ -35,7 +35,7 @@ from pcw_description.differential_kinematics import joint_matrix_blocks
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
 
 from .computed_torque import ComputedTorque, ComputedTorqueParameters, ComputedTorqueState, Demand
-from .controller_interface import ControllerMeasurement, ControllerParameters, parameter
+from .controller_interface import ControllerMeasurement, ControllerParameters, parameter, replaced
 from .force_distribution import solve_kernel
 from .friction_sharing import FrictionOptimal, FrictionParameters
 
@@ -269,7 +269,7 @@ class SlipConstraintForce(ComputedTorque):
         held: Any = state
         velocity = np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64)
         integral, F_con = self.law.added(held.slip_integral, demand.A, velocity, measurement.saturated, dt, F_con)
-        return dataclasses.replace(held, slip_integral=integral), F_con
+        return replaced(held, slip_integral=integral), F_con
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,18 +20,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.differential_kinematics import joint_matrix_blocks
-from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
+from pcw_description.robot_description import DRIVE, FloatArray, RobotDescription
 
-from .computed_torque import ComputedTorqueState
+from .computed_torque import ComputedTorqueState, Demand
 from .controller_interface import (
     ControllerMeasurement,
-    ControllerOutput,
     ControllerParameters,
-    Reference,
-    internal_force_kernel,
     joint_torque_kernel,
     parameter,
+    replaced,
 )
 from .slip_constraint_force import (
     SlipConstraintForce,
@@ -91,55 +88,42 @@ class SlipRatioLimit(SlipConstraintForce):
         )
         self._critical = np.array([tyre.lambda_p for tyre in robot.tyres])
         self._vouched = np.ones((robot.n, 2), dtype=bool)
-        self._to_torque = joint_matrix_blocks(robot)
-        self._to_force = np.linalg.inv(self._to_torque)
 
     def initial_state(self, twist: FloatArray | None = None) -> Any:
         """Return the state of a controller that takes over at a twist (3,), or at rest."""
         return SlipRatioLimitState(**vars(super().initial_state(twist)), ratio=np.zeros((self._n, 4)))
 
-    def step(
-        self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
-    ) -> tuple[ComputedTorqueState, ControllerOutput]:
-        """Compute the torques of one cycle; see `ComputedTorque.step`."""
-        state, output = super().step(state, measurement, reference, dt)
+    def _distribute(
+        self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
+    ) -> tuple[ComputedTorqueState, FloatArray]:
+        """Return the contact forces (n, 2) of SCFC, or those of the drive torques that keep the slip ratios in their band."""
+        state, F_con = super()._distribute(state, demand, measurement, dt)
         before: Any = state
         if measurement.slip is None:
-            return dataclasses.replace(before, ratio=np.zeros((self._n, 4))), output
+            return replaced(before, ratio=np.zeros((self._n, 4))), F_con
         p = self.parameters.ratio
-        ratio, torque, force, internal, changed = _kept_in_band(
-            self._wheels, self._ratio_numbers, before.ratio, self._to_torque, self._to_force, *self._geometry,
-            np.ascontiguousarray(measurement.joint_position, dtype=np.float64),
+        ratio, F_con = _kept_in_band(
+            self._wheels, self._ratio_numbers, before.ratio, self._B, self._B_inverse,
             np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64),
             np.ascontiguousarray(measurement.slip, dtype=np.float64),
             self._vouched if measurement.slip_valid is None else np.ascontiguousarray(measurement.slip_valid, dtype=bool),
-            self._critical if measurement.critical_slip is None else measurement.critical_slip, p.share, p.least,
-            output.torque, dt,
+            self._critical if measurement.critical_slip is None else measurement.critical_slip, p.share, p.least, F_con, dt,
         )  # fmt: skip
-        state = dataclasses.replace(before, ratio=ratio)
-        if not changed:
-            return state, output
-        return state, dataclasses.replace(output, torque=torque, contact_force=force, internal_force=internal)
+        return replaced(before, ratio=ratio), F_con
 
 
 @compiled
 def _kept_in_band(  # type: ignore[no-untyped-def]
-    wheels, numbers, before, B, to_force, steer_axis, caster_offset, joint_position, joint_velocity, slip, vouched, critical,
-    share, least, wanted, dt,
+    wheels, numbers, before, B, to_force, joint_velocity, slip, vouched, critical, share, least, force, dt
 ):
-    """Return the sliding modes (n, 4), torques and forces (n, 2) and internal forces, and whether any torque has changed.
-
-    The drive torques lie within their bounds; forces are those that make the torques, so that what is said of them is true.
-    """
+    """Return the sliding modes (n, 4), and the forces (n, 2) that make the drive torques which lie within their bounds."""
     gain, sliding, layer, filter_time, least_speed = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     n = len(wheels)
-    after, torque, changed = np.zeros((n, 4)), wanted.copy(), False
-    steer_angle = np.empty(n)
+    torque, kept, after = joint_torque_kernel(B, force), force.copy(), np.zeros((n, 4))
     for i in range(n):
-        steer_angle[i] = joint_position[i, STEER]
         if not vouched[i, 0]:
             continue  # and what the sliding mode had found is forgotten
-        band = max(share * critical[i], least)
+        band, drive = max(share * critical[i], least), torque[i, DRIVE]
         inertia, radius, mass, limit = wheels[i, 0], wheels[i, 1], wheels[i, 2], wheels[i, 3]
         # With a lateral offset the turning fork rolls the wheel centre along as well.
         sensed = B[i, 0, 0] * joint_velocity[i, 0] + B[i, 0, 1] * joint_velocity[i, 1]
@@ -154,9 +138,11 @@ def _kept_in_band(  # type: ignore[no-untyped-def]
         if before[i, 0] > 0.0:
             high = max((gain * (band - ratio) - f) / g - average, -limit)
             low = min((gain * (-band - ratio) - f) / g - average, limit)
-            torque[i, DRIVE] = min(max(wanted[i, DRIVE], low), high)
-            changed = changed or torque[i, DRIVE] != wanted[i, DRIVE]
-        held = min(max(torque[i, DRIVE], -limit), limit)
+            change = min(max(drive, low), high) - drive
+            drive += change
+            # The force that changes this torque and leaves the steering its own.
+            kept[i, 0] += to_force[i, DRIVE, 0] * change
+            kept[i, 1] += to_force[i, DRIVE, 1] * change
+        held = min(max(drive, -limit), limit)
         after[i, 0], after[i, 1], after[i, 2], after[i, 3] = 1.0, predicted, average, f + g * (held + w)
-    force = joint_torque_kernel(to_force, torque)
-    return after, torque, force, internal_force_kernel(steer_axis, caster_offset, steer_angle, force), changed
+    return after, kept

@@ -1,6 +1,10 @@
 """The registry: every name makes a controller that keeps the contract's shape, and the README tells of each."""
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +16,14 @@ from pcw_control import (
     ControlError,
     ControllerMeasurement,
     ForceReference,
+    TrajectoryPoint,
     TwistReference,
     make_controller,
 )
 from pcw_control.controller_interface import (
     ControllerParameters,
     internal_forces,
+    replaced,
     settable_fields,
     with_values,
 )
@@ -90,10 +96,83 @@ def test_what_is_optional_is_refused_by_name_where_it_is_no_number_or_of_another
     robot = load_robot("thesis")
     controller, zero = make_controller("computed_torque", robot), np.zeros((4, 2))
     shape = {"slip": (4, 2), "external_wrench": (3,)}.get(field, (4,))
-    for bad in (np.full(shape, np.nan), np.zeros((5, 2)), np.zeros((1, *shape))):
+    for bad in (np.full(shape, np.nan), np.zeros((5, 2)), np.zeros((1, *shape)), np.zeros(0)):
         measurement = ControllerMeasurement(zero, zero, np.zeros(3), **{field: bad})
         with pytest.raises(ControlError, match=field):
             controller.step(controller.initial_state(), measurement, TwistReference(np.zeros(3)), 0.002)
+
+
+@pytest.mark.parametrize("bad", [np.array([0.0, np.nan, 0.0]), np.zeros(0), np.zeros(4), np.zeros((1, 3))], ids=str)
+def test_what_is_to_be_followed_and_felt_is_refused_by_name_where_it_is_no_number_or_of_another_shape(bad):
+    controller, zero = make_controller("force_guided", load_robot("thesis")), np.zeros((4, 2))
+    good, state = np.zeros(3), controller.initial_state()
+    for name, pose, reference in (
+        ("reference twist", good, TwistReference(bad)),
+        ("reference wrench", good, ForceReference(bad)),
+        ("reference twist", good, ForceReference(good, TwistReference(bad))),
+        ("reference pose", good, ForceReference(good, TrajectoryPoint(bad))),
+        ("reference velocity", good, TrajectoryPoint(good, velocity=bad)),
+        ("reference acceleration", good, TrajectoryPoint(good, acceleration=bad)),
+        ("pose", bad, TrajectoryPoint(good)),
+    ):  # fmt: skip
+        with pytest.raises(ControlError, match=f"^{name} = "):
+            controller.step(state, ControllerMeasurement(zero, zero, pose), reference, 0.002)
+
+
+# Torques of every controller in cycles of every kind of reference, with and without what is optional.
+ALL_TORQUES = """
+import json
+import numpy as np
+from pcw_control import CONTROLLERS, ControllerMeasurement, TrajectoryPoint, TwistReference, make_controller
+from pcw_description import load_robot
+
+robot, torques = load_robot("thesis"), {}
+for name in CONTROLLERS:
+    rng, controller = np.random.default_rng(6), make_controller(name, robot)
+    state, torques[name] = controller.initial_state(np.array([0.2, 0.1, 0.1])), []
+    for cycle in range(24):
+        known = dict(
+            slip=rng.normal(0.0, 0.1, (4, 2)), slip_valid=rng.random((4, 2)) < 0.8, friction=rng.uniform(0.1, 0.8, 4),
+            critical_slip=rng.uniform(0.05, 0.2, 4), external_wrench=rng.normal(0.0, 20.0, 3),
+        )
+        measurement = ControllerMeasurement(
+            rng.normal(0.0, 1.0, (4, 2)), rng.normal(0.0, 1.0, (4, 2)), rng.normal(0.0, 0.1, 3), cycle % 5 == 0,
+            **(known if cycle % 4 else {}),
+        )
+        twist, point = TwistReference(rng.normal(0.0, 0.5, 3)), TrajectoryPoint(*rng.normal(0.0, 0.2, (3, 3)))
+        state, output = controller.step(state, measurement, point if cycle % 6 == 5 else twist, 0.002)
+        torques[name].append(output.torque.tolist())
+print(json.dumps(torques))
+"""
+
+
+def test_plain_python_gives_the_same_torques_as_compiled_code():
+    """A machine without numba runs the same controllers; 1e-12 of the largest torque is a few thousand roundings."""
+    compiled, plain = (
+        json.loads(
+            subprocess.run(
+                [sys.executable, "-P", "-c", ALL_TORQUES], env=os.environ | {"NUMBA_DISABLE_JIT": off}, check=True,
+                capture_output=True, text=True, timeout=300,
+            ).stdout
+        )
+        for off in ("0", "1")
+    )
+    assert compiled.keys() == plain.keys() == CONTROLLERS.keys()
+    for name, torques in compiled.items():
+        largest = np.max(np.abs(torques))
+        assert largest > 1.0
+        np.testing.assert_allclose(plain[name], torques, rtol=0.0, atol=1e-12 * largest, err_msg=name)
+
+
+@pytest.mark.parametrize("name", sorted(CONTROLLERS))
+def test_replaced_is_the_replace_of_dataclasses(name):
+    """Of the state of every controller: `replaced` does without the class, which could set or check more than its fields."""
+    state = make_controller(name, load_robot("thesis")).initial_state(np.array([0.3, 0.1, 0.2]))
+    before, twist = dict(vars(state)), np.ones(3)
+    found, wanted = replaced(state, reference_twist=twist), dataclasses.replace(state, reference_twist=twist)
+    assert type(found) is type(wanted) and vars(found).keys() == vars(wanted).keys()
+    assert all(vars(found)[field] is value for field, value in vars(wanted).items())
+    assert vars(state) == before and state.reference_twist is not twist
 
 
 def test_every_number_of_every_controller_has_unit_meaning_and_range():

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .description_fields import load_yaml_mapping, quantity, read_section, section, text
+from .description_fields import parsed_file, quantity, read_section, section, text
 from .effect_instance import EffectInstance
 from .effects.registry import read_physics
 from .errors import DescriptionError, PcwError, nearest_name
@@ -221,7 +221,7 @@ def load_axis_description(path: str | Path) -> AxisDescription:
     Raises:
         DescriptionError: the file is absent or not valid.
     """
-    return parse_axis_description(load_yaml_mapping(path))
+    return parsed_file(path, parse_axis_description)
 
 
 def axis_to_mapping(axis: AxisDescription) -> dict[str, Any]:

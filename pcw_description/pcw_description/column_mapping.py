@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from .description_fields import load_yaml_mapping, quantity, read_section, section, text
+from .description_fields import parsed_file, quantity, read_section, section, text
 from .errors import DescriptionError
 from .robot_description import GRAVITY
 
@@ -172,7 +172,7 @@ def load_column_mapping(path: str | Path) -> ColumnMapping:
     Raises:
         DescriptionError: the file is absent or not valid.
     """
-    return parse_column_mapping(load_yaml_mapping(path))
+    return parsed_file(path, parse_column_mapping)
 
 
 def _written_out(owner: Any) -> Any:

@@ -11,13 +11,15 @@ import math
 import re
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
 from .errors import DescriptionError, nearest_name
+
+Parsed = TypeVar("Parsed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +119,20 @@ def load_yaml_mapping(path: str | Path) -> dict[str, Any]:
         found = "nothing" if content is None else f"one {type(content).__name__}"
         raise DescriptionError("file", str(path), f"it holds {found}; allowed: a mapping of keys to values")
     return content
+
+
+def parsed_file(path: str | Path, parse: Callable[[dict[str, Any]], Parsed]) -> Parsed:
+    """Load one YAML file and parse its mapping.
+
+    Raises:
+        DescriptionError: as `load_yaml_mapping` and `parse`; it names the file.
+    """
+    try:
+        return parse(load_yaml_mapping(path))
+    except DescriptionError as error:
+        if error.key == "file":  # it is named already
+            raise
+        raise DescriptionError(error.key, error.value, error.allowed, str(path)) from None
 
 
 def read_number(value: object, key: str, spec: Quantity) -> float:

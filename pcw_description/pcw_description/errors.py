@@ -19,17 +19,19 @@ class PcwError(ValueError):
 class DescriptionError(PcwError):
     """A robot or axis description that is not valid.
 
-    The message names the key, the value found and what is allowed; the three are attributes too.
+    The message names the key, the value found and what is allowed, and the file where there is one; all are attributes too.
     """
 
-    def __init__(self, key: str, value: object, allowed: str) -> None:
+    def __init__(self, key: str, value: object, allowed: str, file: str = "") -> None:
         self.key = key
         self.value = value
         self.allowed = allowed
+        self.file = file
         found = repr(value)
         if len(found) > LONGEST_VALUE:
             found = found[:LONGEST_VALUE] + "..."
-        super().__init__(f"{key} is missing; {allowed}" if value is None else f"{key}: {found} is not allowed; {allowed}")
+        said = f"{key} is missing; {allowed}" if value is None else f"{key}: {found} is not allowed; {allowed}"
+        super().__init__(f"{file}: {said}" if file else said)
 
 
 class KinematicsError(PcwError):

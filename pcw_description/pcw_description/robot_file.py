@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from .contact.contact_model import tyre_parameters
-from .description_fields import load_yaml_mapping, read_section
+from .description_fields import parsed_file, read_section
 from .effects.registry import read_physics
 from .errors import DescriptionError, nearest_name
 from .robot_description import DEFAULT_TOLERANCES, FORMAT, Caster, FixedWheel, RobotDescription, Tolerance
@@ -155,7 +155,7 @@ def load_robot(robot: str | Path) -> RobotDescription:
             near = nearest_name(str(robot), names)
             raise DescriptionError("robot", str(robot), f"neither a .yaml file nor a shipped robot; {near}")
         path = robots_directory() / f"{robot}.yaml"
-    return parse_robot(load_yaml_mapping(path))
+    return parsed_file(path, parse_robot)
 
 
 def robot_to_mapping(robot: RobotDescription) -> dict[str, Any]:

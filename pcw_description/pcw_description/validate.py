@@ -44,7 +44,7 @@ def check(robots: Sequence[str]) -> int:
         try:
             robot = load_robot(name)
         except PcwError as error:
-            print(f"{name}: {error}", file=sys.stderr)
+            print(error, file=sys.stderr)
             exit_code = 2
             continue
         remark = ""

@@ -207,7 +207,17 @@ def test_key_given_twice_is_refused_with_its_line(tmp_path: Path) -> None:
     path.write_text(text.replace("  mass: 74.0\n", "  mass: 74.0\n  mass: 47.0\n", 1), encoding="utf-8")
     line = text[: text.index("  mass: 74.0")].count("\n") + 2
     problem = "it stands there a second time; allowed: each key once"
-    assert message_of_file(path) == f"line {line}: 'mass' is not allowed; {problem}"
+    assert message_of_file(path) == f"{path}: line {line}: 'mass' is not allowed; {problem}"
+
+
+def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
+    """Who gives several files is told which one."""
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(changed("chassis/mass", -1.0)), encoding="utf-8")
+    with pytest.raises(DescriptionError) as caught:
+        load_robot(path)
+    assert str(caught.value).startswith(f"{path}: chassis.mass: -1.0 is not allowed; ")
+    assert (caught.value.file, caught.value.key) == (str(path), "chassis.mass")
 
 
 @pytest.mark.parametrize(

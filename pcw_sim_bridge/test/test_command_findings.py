@@ -61,3 +61,21 @@ def test_torques_logged_with_the_state_they_were_computed_from_are_no_dead_time(
     assert command_findings(problems, (), 0, None, lambda message: None).named == ()
     for problem in problems:
         assert np.std(problem.residual) == pytest.approx(0.02, rel=0.05)
+
+
+@pytest.mark.parametrize("later", [0.0, 1.0])
+def test_stamps_that_tremble_are_no_dead_time(later):
+    """Half of the commands seem to come before the state that they answer, and the drives to obey some intervals late."""
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), ())
+    commands, joints = recording.joint_commands, recording.joint_states
+    held = np.searchsorted(commands.stamp, joints.stamp + (2.0 * later - 1.0) * 1e-6) - 1
+    rng = np.random.default_rng(1)
+
+    def tremble(stamp):
+        return np.maximum.accumulate(stamp + 5e-5 * rng.standard_normal(len(stamp)))
+
+    effort = commands.effort[held] + 0.02 * rng.standard_normal(joints.effort.shape)
+    joints = dataclasses.replace(joints, stamp=tremble(joints.stamp), effort=effort)
+    commands = dataclasses.replace(commands, stamp=tremble(commands.stamp))
+    recording = dataclasses.replace(recording, joint_states=joints, joint_commands=commands)
+    assert command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None).named == ()

@@ -1,4 +1,4 @@
-"""Terms of one effect on single casters are offered together for one on all of them."""
+"""Terms of one effect on single casters are offered together for one on all of them, and two look-alikes for one."""
 
 from types import SimpleNamespace
 
@@ -12,14 +12,16 @@ ALL = ("a", "b", "c")
 SIZE = LinearParameter("size", "N m", 0.0, 1.0, 1.0)
 
 
-def term(effect, target, axis=None):
-    return Term(effect, target, (SIZE,), ({},), lambda shape: np.zeros((1, 1, 1)), axis=axis)
+def term(effect, target, axis=None, resolution=()):
+    shapes = {name: ("linear", 0.1) for name in resolution}
+    return Term(effect, target, (SIZE,), ({},), lambda shape: np.zeros((1, 1, 1)), axis=axis, resolution=shapes)
 
 
 TERMS = [
     term("actuator_lag", ("a",), "steer"), term("actuator_lag", ("b",), "steer"), term("actuator_lag", ALL, "steer"),
     term("actuator_delay", ALL, "steer"), term("actuator_delay", ALL, "drive"), term("actuator_delay", ("a",), "steer"),
     term("payload_mass", ("chassis",)), term("actuator_lag", ("c",), "drive"),
+    term("payload_offset", ("chassis",)), term("payload_mass", ("chassis",), None, ("x", "y")),
 ]  # fmt: skip
 
 
@@ -40,3 +42,9 @@ def test_one_alone_is_not_gathered_nor_are_different_axes():
 
 def test_what_is_on_all_already_may_still_be_a_look_alike():
     assert offered(2, 0) == [([], [3])]
+
+
+def test_a_payload_at_the_wrong_place_and_what_makes_up_for_it_may_be_one_payload():
+    """Its place is searched; without that, either says what the other cannot."""
+    assert offered(8, 9) == [([], [9])]
+    assert offered(8, 6) == []

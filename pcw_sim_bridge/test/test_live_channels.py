@@ -1,5 +1,6 @@
 """The live watch without ROS: a healthy robot stays near one deviation, a fault that begins is seen soon and in its place."""
 
+import copy
 import dataclasses
 import json
 import struct
@@ -131,6 +132,23 @@ def test_a_lost_sensor_is_said_and_the_others_go_on(learned: Tuning, friction: l
     assert last.silent == ("gyro", "accelerometer/x", "accelerometer/y")
     assert "gyro has no sensor now" in last.problems
     assert last.level is Level.OK
+
+
+@pytest.mark.parametrize(
+    ("topic", "gap"), [("joint_states", 0.03), ("joint_states", 0.3), ("imu/data", 0.3), ("ground_truth/odom", 0.2)]
+)
+def test_lost_messages_are_no_departure(learned: Tuning, friction: list[RawMessage], topic: str, gap: float) -> None:
+    begins = FAULT_TIME + 1.0 - np.array([3.1, 1.7, 0.9])
+
+    def lost(message: RawMessage) -> bool:
+        age = message.log_time_ns * 1e-9 - begins
+        return message.topic.strip("/") == topic and bool(np.any((age > 0.0) & (age < gap)))
+
+    healthy = [m for m in after(friction, FAULT_TIME - 6.0) if m.log_time_ns < (FAULT_TIME + 1.0) * 1e9]
+    live = LiveChannels(THESIS, PARAMETERS, copy.deepcopy(learned))
+    seen = [judgement for _, judgement, _ in judgements(live, (m for m in healthy if not lost(m)))]
+    assert sum(bool(judgement.channels) for judgement in seen) > 5
+    assert all(judgement.level is Level.OK for judgement in seen)
 
 
 def test_nothing_to_compare_is_said(friction: list[RawMessage]) -> None:

@@ -159,7 +159,7 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    "name", ["flow_base", "dyros_pcv", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("xr4000", "tidybot2"))]
+    "name", ["flow_base", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("dyros_pcv", "xr4000", "tidybot2"))]
 )
 def test_intervals_hold_the_truth_on_other_robots(name: str, tmp_path: Path) -> None:
     """Other sizes, offsets and gear couplings; the friction is 4 % of what the drive can give."""

@@ -62,6 +62,7 @@ def few(*names: str) -> list[Excitation]:
     return [make_excitation(name, THESIS, 20.0) for name in names]
 
 
+@pytest.mark.nightly
 def test_a_doubt_is_settled_by_what_the_report_leads_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from pcw_sim_bridge.mismatch.regression_problem import (
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
 from pcw_sim_bridge.mismatch.shape_search import refined_shape, shape_interval
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.whitened_regression import Instance, WhitenedRegression
 
 SAMPLES, RATE = 600, 50.0
 NOISE = 0.01
@@ -422,12 +423,71 @@ def test_an_exchange_that_does_not_last_leaves_the_selection_where_it_was(monkey
         return selection
 
     monkeypatch.setattr(search, "_alike", lambda chosen, others, own: [rival])
-    monkeypatch.setattr(search, "_exact_evidence", lambda regression, fit: 100.0 * (rival in fit.instances))
+    left = np.zeros(3)
+    monkeypatch.setattr(search, "_reached", lambda regression, fit: (100.0 * (rival in fit.instances), left))
+    monkeypatch.setattr(WhitenedRegression, "odds", lambda regression, difference, left, other: difference)
     monkeypatch.setattr(search, "settle_on", elsewhere)
     here = search.problem, search._point
     assert search.against_alike(selection) is selection
     assert search.problem is here[0]
     assert search._point is here[1]
+    assert search.where_exact == {(0, 1): 100.0}
+
+
+def test_a_set_far_out_is_given_up_where_less_does_as_well_from_the_description_on(monkeypatch):
+    """Stronger motors, a payload and larger inertias were found in a healthy robot: without any two of them nothing fitted."""
+    time = np.arange(3000) / RATE
+    columns = np.sin(2.1 * time), np.sin(3.7 * time)
+    left = columns[0] + columns[1] + NOISE * np.random.default_rng(4).standard_normal(len(time))
+    problem = linear_problem(left, {"one": (columns[0], 100.0), "other": (columns[1], 100.0)})
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.conclude((Instance(0, (), (0,)), Instance(1, (), (0,))), 5.0)
+    here = search.problem = dataclasses.replace(problem)
+    assert search.against_fewer(selection) is selection
+    assert search.problem is here
+    monkeypatch.setattr(search, "_exact_evidence", lambda regression, fit: -100.0 * len(fit.instances))
+    monkeypatch.setattr(search, "settle_on", lambda chosen, threshold: chosen)
+    assert search.against_fewer(selection).fit.instances == ()
+    assert search.problem is problem
+
+
+def test_a_rival_that_does_as_well_elsewhere_is_said_to_be_one():
+    """Stiffer tyres along, all tyres being softer, are softer tyres across: no first order leads from one to the other."""
+    time = np.arange(3000) / RATE
+    column = np.sin(2.1 * time)
+    left = 2.0 * column + NOISE * np.random.default_rng(4).standard_normal(len(time))
+    problem = linear_problem(left, {"one": (column, 100.0), "other": (np.sin(3.7 * time), 100.0)})
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.conclude((Instance(0, (), (0,)),), 5.0)
+    assert named_terms(search, selection)[0].probability > 0.999
+    search.where_exact[0, 1] = -1.0
+    named = named_terms(search, selection)[0]
+    assert named.ambiguous_with == ("other",)
+    assert named.probability == pytest.approx(1.0 / (1.0 + math.exp(-1.0)), abs=1e-3)
+
+
+@pytest.mark.parametrize(("off", "loose", "names"), [(8.0, False, ["same"]), (8.0, True, []), (20.0, True, ["same"])])
+def test_what_tyres_are_re_tuned_by_hardly_speaks_for_an_effect(off, loose, names):
+    """All that it does is less than the model misjudges; without it a number is off, and numbers of tyres often are."""
+    time = np.arange(3000) / RATE
+    works = np.cos(0.3 * time)
+    left = 1e-3 * off * works + 0.01 * np.random.default_rng(7).standard_normal(len(time))
+    problem = linear_problem(left, {"same": (works, 100.0)})
+    problem = dataclasses.replace(problem, nuisances=(dataclasses.replace(problem.nuisances[0], loose=loose),))
+    assert chosen(problem) == names
+
+
+@pytest.mark.parametrize(("tolerance", "names"), [(0.047, []), (0.03, ["same"])])
+def test_a_gear_that_a_number_can_stand_in_for_is_named_only_where_that_is_far_off(tolerance, names):
+    """Under noisy torques it does a little of everything, and relieves some number by as much as chance does."""
+    time = np.arange(3000) / RATE
+    works = np.cos(0.3 * time)
+    left = 0.3 * works + 0.01 * np.random.default_rng(7).standard_normal(len(time))
+    problem = linear_problem(left, {"same": (works, 100.0)}, noisy=True)
+    term = problem.terms[0]
+    narrow = dataclasses.replace(term, parameters=(dataclasses.replace(term.parameters[0], deviation=0.3),))
+    number = dataclasses.replace(problem.nuisances[0], deviation=tolerance)
+    assert chosen(dataclasses.replace(problem, nuisances=(number,), terms=(narrow,))) == names
 
 
 def test_noise_in_its_columns_is_no_need_of_an_effect():

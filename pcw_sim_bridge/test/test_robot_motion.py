@@ -1,4 +1,4 @@
-"""Where the channels end: at what torques tell beyond their noise."""
+"""Where the channels end: at what torques tell beyond their noise. And what stands where samples are missing."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.robot_motion import SMALLEST_CUTOFF, choose_cutoff
+from pcw_sim_bridge.mismatch.signal_filter import interpolated
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
@@ -57,3 +58,54 @@ def test_without_torques_or_with_slow_ones_they_say_nothing(lively: Recording) -
     assert choose_cutoff(THESIS, [with_torques(lively, np.zeros_like(torque))]) == widest
     wide = with_torques(lively, np.random.default_rng(2).standard_normal(torque.shape).cumsum(axis=0))
     assert choose_cutoff(THESIS, [wide]) == widest
+
+
+def test_a_gap_is_bent_as_its_surroundings_and_a_long_one_is_left_open() -> None:
+    noise, rng = 1e-4, np.random.default_rng(3)
+    time = np.arange(0.0, 4.0, 0.002)
+    swings = np.sin(2.0 * np.pi * np.array([1.0, 3.0]) * time[:, None])
+    measured = swings + noise * rng.standard_normal(swings.shape)
+    there = ~((time > 1.03) & (time < 1.07)) & ~((time > 2.0) & (time < 2.1))
+    found = interpolated(time, time[there], measured[there], 0.05)
+    gap, pause = (time > 1.03) & (time < 1.07), (time > 2.0005) & (time < 2.0995)
+    lines = np.stack([np.interp(time, time[there], column) for column in measured[there].T], axis=1)
+    error, of_lines = (np.abs(values - swings)[gap].max(axis=0) for values in (found, lines))
+    assert np.all(error < [3.0 * noise, 150.0 * noise]) and np.all(of_lines > 5.0 * error)
+    assert np.isnan(found[pause]).all() and np.isfinite(found[~pause]).all()
+    assert np.array_equal(found[there], measured[there])
+    assert np.isnan(interpolated(np.array([-1.0, 5.0]), time, measured, 0.05)).all()
+
+
+def test_a_gap_is_filled_beside_what_was_not_recorded_and_left_open_among_others() -> None:
+    time = np.arange(0.0, 2.0, 0.002)
+    swing = np.sin(2.0 * np.pi * 3.0 * time)
+    single = (time > 1.001) & (time < 1.031)
+    found = interpolated(time, time[~single], np.stack([swing, np.full_like(swing, np.nan)], axis=1)[~single], 0.05)
+    assert np.abs(found[:, 0] - swing).max() < 5e-3 and np.isnan(found[:, 1]).all()
+    many = (time > 0.501) & (time < 1.501) & (time % 0.04 < 0.035)
+    found = interpolated(time, time[~many], swing[~many, None], 0.05)
+    assert np.isnan(found[many & (time > 0.6) & (time < 1.4)]).all()
+
+
+def test_a_slow_sensor_has_no_gap_and_missing_values_stay_missing() -> None:
+    time = np.arange(0.0, 4.0, 0.1)
+    values = np.stack([time, np.where(time < 2.05, np.nan, time)], axis=1)
+    there = np.arange(len(time)) != 10
+    found = interpolated(np.array([0.55, 0.98, 3.0]), time[there], values[there], 0.05)
+    assert found[:, 0] == pytest.approx([0.55, 0.98, 3.0]) and np.isnan(found[:2, 1]).all()
+
+
+def test_a_slow_sensor_sees_bends_and_a_pause_of_it_stays_open() -> None:
+    time = np.arange(0.0, 6.0, 0.06)
+    grid = np.arange(0.0, 5.9, 0.002)
+    there = (time < 2.5) | (time > 3.2)
+
+    def swing(at: np.ndarray) -> np.ndarray:
+        return 10.0 + np.sin(2.0 * np.pi * 1.5 * at)[:, None]
+
+    found = interpolated(grid, time[there], swing(time[there]), 0.1)
+    pause = (grid > 2.47) & (grid < 3.23)
+    assert np.isnan(found[pause]).all()
+    well_inside = ~((grid < 0.2) | (grid > 5.7) | ((grid > 2.2) & (grid < 3.5)))
+    assert np.abs(found - swing(grid))[well_inside].max() < 2e-3
+    assert np.nanmax(np.abs(found - swing(grid))) < 0.02

@@ -11,6 +11,12 @@ the joints that are measured it is given those of wheels that roll (`controller_
 creep under the forces they take, by the lower root of mu(lambda); where the ground is not known, as much as the first slip of
 the test tells. It is taken off too, and casters are driven or braked so that what is left of it cancels out.
 
+That creep is V lambda + L lambda_dot. Its second part, the shear of a tyre as it is loaded, is taken off positions and off the
+twist that is told, not off the velocities that controller and wheel are led by. Less their shear these are the body's and no
+longer the joints': tyre and observer lie between motor and sensor. With a creep c per friction and the controller's gains k_d
+and k_p, that loop has the gain k_d L c s / g, which a soft tyre brings to about 1, and past it an observer that believes in
+a stiffer one: the robot shakes at 8 Hz. In the positions the shear is only k_p L c / g, a few percent.
+
 Slip grows exponentially, so that a peak is passed equally slowly wherever it lies. It ends where the ground is known, or at
 `greatest_slip`. It does not begin, and ends at once, where it is not safe; see `Refusal` for the reasons.
 """
@@ -32,6 +38,9 @@ from .errors import TerrainError, require, require_dt
 CREEP_RATE = 100.0
 # At which slip that no creep explains is followed; differences of encoder angles are rough [rad/s].
 STRAY_RATE = 50.0
+# Part of a wheel's slip that the twist does not take for motion and by which it is scaled up, at least: noise grows with one
+# over its root, and is no more than doubled [1].
+LEAST_SHARE = 0.25
 # Slip up to which friction is taken as proportional to it [1], and squared friction times speed needed [m^2/s^2].
 CREEP_SLIP, LEAST_CREEP = 0.04, 0.01
 # How much more a turn counts than a way, at the place of the outermost caster.
@@ -171,7 +180,7 @@ class ActiveState:
         integral: of the wheel's speed loop [N m].
         rolled_ahead: by how much the joints have turned further than wheels that roll would have (n, 2) [rad].
         creep: slip ratios that the forces take, filtered (n, 2) [1].
-        strays: slip velocities that no creep explains, filtered (n,) [m/s].
+        strays: what the common twist leaves of the velocities of the others, creep taken off, filtered (n,) [m/s].
         creep_sums: of slip and of what friction feigns, each times the wanted slip, at the beginning of the test, and the
             relaxed slip (3,).
         spent: sum of the wrenches so far of the casters under test, for a force of 1 (3,) [1, 1, m].
@@ -199,7 +208,8 @@ class ActiveOutput:
 
     Attributes:
         torque: to be added to the controller's (n, 2) [N m].
-        controller_position, controller_velocity: joints as the controller should see them (n, 2) [rad], [rad/s].
+        controller_position, controller_velocity: joints as the controller should see them (n, 2) [rad], [rad/s]; the
+            velocity is not the derivative of the position, see the module's docstring.
         twist: of base_link, from the casters that are not under test, less the slip that their forces take (3,).
         testing: index of the caster under test, or -1.
         net_wrench: A^T dF, which is nothing but rounding (3,) [N, N, N m].
@@ -341,21 +351,22 @@ class ActiveIdentification:
         steer_angle = np.ascontiguousarray(m.position[:, STEER])
         A = wheel_jacobian_kernel(self.robot.steer_axis, self.robot.caster_offset, steer_angle)
         sensed = np.einsum("nij,nj->ni", self._B, m.velocity)
-        state, creep = self._creep(state, m, sensed, dt)
+        state, steady, shear = self._creep(state, m, sensed, dt)
         busy = state.phase in (Phase.WAIT, Phase.SLIP, Phase.RETURN)
-        creep = creep if busy else np.zeros_like(creep)
-        rolled = sensed - creep
+        rolled = sensed - steady if busy else sensed
+        moved = rolled - shear if busy else sensed
         testing = state.queue[0] if state.phase in (Phase.SLIP, Phase.RETURN) else -1
-        twist = self._twist(A, rolled, testing)
+        twist = self._twist(A, moved, testing)
         state = dataclasses.replace(state, elapsed=state.elapsed + dt)
         if state.phase is Phase.WAIT and (state.refusal is Refusal.CANCELLED or state.elapsed >= p.rest_time):
             state = self._begin(state, m, A, twist)
             testing = state.queue[0] if state.phase is Phase.SLIP else -1
         if testing < 0:
-            seen = m.velocity - np.einsum("nij,nj->ni", self._B_inverse, creep)
-            state = dataclasses.replace(state, rolled_ahead=state.rolled_ahead + (m.velocity - seen) * dt)
+            seen = np.einsum("nij,nj->ni", self._B_inverse, rolled)
+            rolls = np.einsum("nij,nj->ni", self._B_inverse, moved)
+            state = dataclasses.replace(state, rolled_ahead=state.rolled_ahead + (m.velocity - rolls) * dt)
             return state, ActiveOutput(np.zeros((self.n, 2)), self._seen_position(state, m), seen, twist, -1, np.zeros(3), 0.0)
-        return self._slip(state, m, A, sensed, creep, twist, testing, dt)
+        return self._slip(state, m, A, sensed, rolled, moved, testing, dt)
 
     def _begin(self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> ActiveState:
         refusal = state.refusal if state.refusal is Refusal.CANCELLED else self._unsafe(state.queue[0], m, A, twist)
@@ -400,19 +411,20 @@ class ActiveIdentification:
         return Refusal.OTHERS_NEAR_LIMIT if use.max() > p.others_use else Refusal.NONE
 
     def _slip(
-        self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, sensed: FloatArray, creep: FloatArray,
-        twist: FloatArray, testing: int, dt: float,
+        self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, sensed: FloatArray, rolled: FloatArray,
+        moved: FloatArray, testing: int, dt: float,
     ) -> tuple[ActiveState, ActiveOutput]:  # fmt: skip
         p = self.parameters
-        velocity, slip_before = float(A[2 * testing] @ twist), state.slip
+        twist, guide = self._twist(A, moved, testing), self._twist(A, rolled, testing)
+        velocity, slip_before = float(A[2 * testing] @ guide), state.slip
         if state.phase is Phase.SLIP:
             size = p.first_slip * math.expm1(p.growth * state.elapsed)
             known = bool(m.known[testing]) and size > p.enough * float(m.lambda_p[testing])
-            stray = (sensed - creep - (A @ twist).reshape(-1, 2))[:, 0]
+            stray = (moved - (A @ twist).reshape(-1, 2))[:, 0]
             stray[testing] = 0.0
             strays = state.strays - math.expm1(-STRAY_RATE * dt) * (stray - state.strays)
             state = dataclasses.replace(state, strays=strays)
-            if np.abs(strays).max() > p.others_slip * max(abs(velocity), p.least_speed):
+            if self._slip_of_another(A, strays, testing) > p.others_slip * max(abs(velocity), p.least_speed):
                 state = self._ended(state, Refusal.OTHERS_SLIP)
             elif state.elapsed > p.longest:
                 state = self._ended(state, Refusal.TOO_LONG)
@@ -431,9 +443,8 @@ class ActiveIdentification:
         slip = min(max(state.slip + lead, -GREATEST_LEAD), GREATEST_LEAD)
         # (3.43): driving, v = (1 - lambda) r rho_dot; braking, r rho_dot = (1 + lambda) v.
         rolling = velocity / (1.0 - slip) if slip >= 0.0 else velocity * (1.0 + slip)
-        wheel_velocity = A[2 * testing : 2 * testing + 2] @ twist
-        rolls = self._B_inverse[testing] @ wheel_velocity
-        wanted = rolls[DRIVE] + (rolling - velocity) / self.robot.wheel_radius[testing]
+        led = float((self._B_inverse[testing] @ A[2 * testing : 2 * testing + 2] @ guide)[DRIVE])
+        wanted = led + (rolling - velocity) / self.robot.wheel_radius[testing]
         error = wanted - m.velocity[testing, DRIVE]
         gain = p.wheel_gain * self._inertia[testing] / dt
         limit = self.robot.torque_limit[testing, DRIVE]
@@ -450,9 +461,11 @@ class ActiveIdentification:
         force = np.zeros((self.n, 2))
         force[testing], force[index] = more, others
         use = np.linalg.norm(others, axis=1) / np.maximum(m.normal_force[index] * m.mu_p[index], 1e-9)
-        seen = m.velocity - np.einsum("nij,nj->ni", self._B_inverse, creep)
-        seen[testing, DRIVE] = rolls[DRIVE]
-        ahead = state.rolled_ahead + (m.velocity - seen) * dt
+        seen = np.einsum("nij,nj->ni", self._B_inverse, rolled)
+        seen[testing, DRIVE] = led
+        rolls = np.einsum("nij,nj->ni", self._B_inverse, moved)
+        rolls[testing] = self._B_inverse[testing] @ A[2 * testing : 2 * testing + 2] @ twist
+        ahead = state.rolled_ahead + (m.velocity - rolls) * dt
         state = dataclasses.replace(state, integral=integral, rolled_ahead=ahead)
         output = ActiveOutput(
             torque, self._seen_position(state, m), seen, twist, testing, A.T @ force.ravel(), float(use.max())
@@ -517,15 +530,15 @@ class ActiveIdentification:
             self.robot.steer_axis, self.robot.caster_offset, np.ascontiguousarray(measurement.position[:, STEER])
         )
         sensed = np.einsum("nij,nj->ni", self._B, measurement.velocity)
-        state, creep = self._creep(state, measurement, sensed, dt)
-        return state, self._twist(A, sensed - creep, testing)
+        state, steady, shear = self._creep(state, measurement, sensed, dt)
+        return state, self._twist(A, sensed - steady - shear, testing)
 
     def _creep(
         self, state: ActiveState, m: ActiveMeasurement, sensed: FloatArray, dt: float
-    ) -> tuple[ActiveState, FloatArray]:
-        """Return the slip velocities (n, 2) [m/s] that the forces take on the lower root of Kiencke's curve (3.47).
+    ) -> tuple[ActiveState, FloatArray, FloatArray]:
+        """Return the creep V lambda and the shear L lambda_dot (n, 2) [m/s] that the forces take on the lower root of (3.47).
 
-        eps = V lambda + L lambda_dot, with the tyre's relaxation length L; see `pcw_description.contact.contact_model`.
+        The slip velocity is their sum, with the tyre's relaxation length L; see `pcw_description.contact.contact_model`.
         """
         force = np.linalg.norm(m.force, axis=1)
         use = np.minimum(force / np.maximum(m.mu_p * m.normal_force, 1e-9), 0.95)
@@ -534,7 +547,7 @@ class ActiveIdentification:
         grows = CREEP_RATE * (slip - state.creep)
         state = dataclasses.replace(state, creep=state.creep + -math.expm1(-CREEP_RATE * dt) * (slip - state.creep))
         speed = np.linalg.norm(sensed, axis=1)
-        return state, speed[:, None] * slip + self._relaxation[:, None] * grows
+        return state, speed[:, None] * slip, self._relaxation[:, None] * grows
 
     def _twist(self, A: FloatArray, sensed: FloatArray, testing: int) -> FloatArray:
         rows = np.ones(2 * self.n, dtype=bool)
@@ -542,6 +555,19 @@ class ActiveIdentification:
             rows[2 * testing : 2 * testing + 2] = False
         rest = A[rows]
         return np.asarray(np.linalg.solve(rest.T @ rest, rest.T @ sensed.ravel()[rows]), dtype=np.float64)
+
+    def _slip_of_another(self, A: FloatArray, strays: FloatArray, testing: int) -> float:
+        """Return how fast one of the others slips against the rest of them [m/s], from what the twist leaves of each (n,).
+
+        A wheel that slips by eps also draws the twist after it: of eps is left the share 1 - h_ii, with the projection
+        H = A (A^T A)^-1 A^T of those that the twist is from, and -h_ij of it at the others. The one that slips is that of
+        the greatest |stray| / sqrt(1 - h_ii), the outlier of least squares; stray / (1 - h_ii) is its eps.
+        """
+        drive, rest = A[::2], np.delete(A, (2 * testing, 2 * testing + 1), axis=0)
+        share = 1.0 - np.einsum("ij,ji->i", drive, np.linalg.solve(rest.T @ rest, drive.T))
+        share = np.maximum(share, LEAST_SHARE)
+        outlier = int(np.argmax(np.abs(strays) / np.sqrt(share)))
+        return float(abs(strays[outlier]) / share[outlier])
 
     @staticmethod
     def _seen_position(state: ActiveState, m: ActiveMeasurement) -> FloatArray:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pcw_description.description_fields import load_yaml_mapping, quantity, read_section, section, text
+from pcw_description.description_fields import parsed_file, quantity, read_section, section, text
 from pcw_description.errors import DescriptionError, nearest_name
 from pcw_description.robot_description import AXIS_NAMES, FloatArray, RobotDescription
 
@@ -126,7 +126,7 @@ def read_can_file(path: str | Path, robot: RobotDescription) -> CanFile:
     Raises:
         DescriptionError: names the key, the value and what is allowed.
     """
-    return can_file_from(load_yaml_mapping(find_can_file(path)), robot)
+    return parsed_file(find_can_file(path), lambda content: can_file_from(content, robot))
 
 
 def find_can_file(path: str | Path) -> Path:

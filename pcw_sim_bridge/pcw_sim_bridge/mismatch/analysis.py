@@ -33,7 +33,7 @@ from .generated_effect import NoSuchKernelError, generate
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
-from .regression_problem import HEALTHY, FloatArray, RegressionProblem
+from .regression_problem import HEALTHY, STRAINED, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep
 from .subject import Subject
@@ -272,7 +272,7 @@ def _retuned(problem: RegressionProblem, fit: Fit) -> tuple[RetunedFinding, ...]
             found.append(
                 RetunedFinding(
                     nuisance.name, nuisance.unit, nuisance.nominal, value, value - half, value + half, nuisance.deviation,
-                    nuisance.healthy,
+                    math.inf if nuisance.loose else STRAINED * nuisance.deviation,
                 )
             )
     return tuple(found)

@@ -16,6 +16,9 @@ ABOVE_BURSTS = 3.0
 # By so much more must effects stand out whose columns hold noise that the residual holds; and by so much more again where they
 # are on all casters alike: what gears that wind up do to all wheels at once, a chassis that pitches on its springs does, too.
 NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
+# What tyres are re-tuned by counts so little for an effect beside which they are not: what the model misjudges of slips does
+# the same to them.
+LOOSE_PART = 0.2
 # Such an effect must do this part of what remains in some channel, and all of it where it is on all casters, as noise is.
 NOISY_PART = 0.75
 
@@ -67,14 +70,15 @@ class EffectGates:
             changes.append(change)
             net.append(self._sizes(change, _at_work(part) if once else None))
             bursts.append(0.5 * self._largest_burst(unexplained, _at_work(part)) if once else 0.0)
-            retunings.append(retuning)
+            firm = regression.tolerance_cost(without, firm=True) - regression.tolerance_cost(fit, firm=True)
+            retunings.append(firm + LOOSE_PART * (retuning - firm))
         total = np.sqrt(np.sum(np.square(own), axis=0))
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
             floors = remains, self.settings.smallest_part * total
             share = self._share(regression, [instance], changes[index], sizes, floors)
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
-            needed = retunings[index] / self.settings.smallest_threshold
+            needed = retunings[index] / (self.settings.smallest_threshold * self._noise_factor([instance]))
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
                 beside = sizes / np.maximum(self._least(instance) * remains, 1e-300)
                 alone = own[index] / np.maximum(np.maximum(NOISY_FACTOR * remains, self._details([instance])), 1e-300)

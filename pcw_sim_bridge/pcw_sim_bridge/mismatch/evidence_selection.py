@@ -7,7 +7,8 @@
 3. Prune: drop every term whose loss in evidence stays below the threshold, that does not lower the error on held-out
    blocks, or that moves no channel by a fair part of what is left of it. Exchange terms where another one does better.
 4. Settle: make the problem exact at what is left, ask whether something that was dropped is missing now, and prune again.
-5. Ask of every effect whose work re-tuned numbers could do whether they do it as well once the problem is exact at those.
+5. Ask whether fewer effects do as well from the description on, and whether one that looks like an effect does more.
+6. Ask of every effect whose work re-tuned numbers could do whether they do it as well once the problem is exact at those.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+
+from pcw_description.effects.registry import all_effects
 
 from .effect_gates import EffectGates
 from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
@@ -29,6 +32,8 @@ from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # Effects of so little less evidence [nats] are alike, and at most so many are tried; those of so much less are not looked at.
 ALIKE, MOST_ALIKE, FAR = 10.0, 3, 30.0
+# So many tolerances that a number has moved are far.
+FAR_MOVED = 2.0
 # What stands in for an effect that a gate stops must be worth so much [nats]: of little, much is alike.
 LEAST_STAND_IN = 30.0
 # So often a chosen set is asked whether something that was dropped should come back.
@@ -67,6 +72,9 @@ class EffectSearch(SetGrowth):
         """Take a problem that is exact at the description."""
         super().__init__(problem, settings, progress)
         self.rng = rng
+        self.description = problem
+        # Log odds of a rival in place of a term that is named, both where they are exact: by (named, rival).
+        self.where_exact: dict[tuple[int, int], float] = {}
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
         self.noise_gain = (0.0, 1.0)
 
@@ -93,7 +101,8 @@ class EffectSearch(SetGrowth):
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
         threshold = self.calibrate(regression, instances)
-        return self.retuned_away(self.against_alike(self.settle_on(self.prune(regression, instances, threshold), threshold)))
+        selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
+        return self.bounded(self.retuned_away(self.against_alike(self.against_fewer(selection))))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
         """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
@@ -143,27 +152,90 @@ class EffectSearch(SetGrowth):
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
         return selection
 
+    def bounded(self, selection: Selection) -> Selection:
+        """Drop effects that come out beyond their bounds where they were not found exactly: as such they are nothing."""
+        instances = selection.fit.instances
+        within = selection.regression.each_within_bounds(selection.fit, strictly=True)
+        if all(within):
+            return selection
+        index = min((k for k, inside in enumerate(within) if not inside), key=selection.losses.__getitem__)
+        self._note_drop(self.label(instances[index]), selection.losses[index], "beyond its bounds")
+        others = instances[:index] + instances[index + 1 :]
+        return self.bounded(self.retuned_away(self.prune(self.whiten_beside(others), others, selection.threshold)))
+
+    def against_fewer(self, selection: Selection) -> Selection:
+        """Exchange a set for a smaller one that does as well from the description on.
+
+        Stronger motors, a payload and larger inertias undo each other. Once the search is far out along that way, a first
+        order leads nowhere without any two of them, and all of them would be needed.
+        """
+        instances = selection.fit.instances
+        if len(instances) < 2:
+            return selection
+        here, own = (self.problem, self._point), self._exact_evidence(selection.regression, selection.fit)
+        regression = selection.regression.moved(self.description)
+        fewer: tuple[Instance, ...] = ()
+        while len(fewer) <= len(instances) - 2:
+            self.problem, self._point = self.description, None
+            gain = self._exact_evidence(regression, regression.fit(fewer)) - own
+            if gain > -selection.threshold:
+                said = " and ".join(map(self.label, fewer)) or "nothing"
+                self.progress(f"{said} alone, from the description on: {gain:.1f} nats")
+                return self.settle_on(self.conclude(fewer, selection.threshold), selection.threshold)
+            rest = [instance for instance in instances if instance not in fewer]
+            fewer = (*fewer, max(rest, key=lambda instance: regression.fit((*fewer, instance)).log_evidence))
+        self.problem, self._point = here
+        return selection
+
     def against_alike(self, selection: Selection) -> Selection:
         """Exchange an effect for one that does the same to first order, where that one does more when both are exact."""
         instances = selection.fit.instances
         for index, instance in enumerate(instances):
             others = instances[:index] + instances[index + 1 :]
-            rivals = self._alike(selection, others, instance)
-            if not rivals:
-                continue
-            own = self._exact_evidence(selection.regression, selection.fit)
-            for rival in rivals:
-                evidence = self._exact_evidence(selection.regression, selection.regression.fit((*others, rival)))
-                if evidence < own + STEADY_EVIDENCE:
-                    continue
-                gain = evidence - own
-                self.progress(f"exchange {self.label(instance)} for {self.label(rival)}: {gain:.1f} nats where exact")
-                here = self.problem, self._point
-                instead = self.settle_on(self.conclude((*others, rival), selection.threshold), selection.threshold)
-                if any(found.term == rival.term for found in instead.fit.instances):
-                    return instead
-                self.problem, self._point = here  # the selection is exact there
+            here = self.problem, self._point
+            starts = [(here, self._alike(selection, others, instance))]
+            if self._is_strained(selection.fit):
+                starts.append(self._alike_from_description(selection, others, instance))
+            own: tuple[float, FloatArray] | None = None
+            for start, rivals in starts:
+                for rival in rivals:
+                    self.problem, self._point = here
+                    own = self._reached(selection.regression, selection.fit) if own is None else own
+                    self.problem, self._point = start
+                    regression = selection.regression.moved(self.problem)
+                    evidence, left = self._reached(regression, regression.fit((*others, rival)))
+                    gain = evidence - own[0]
+                    self.where_exact[instance.term, rival.term] = regression.odds(gain, own[1], left)
+                    if gain < STEADY_EVIDENCE:
+                        continue
+                    self.progress(f"exchange {self.label(instance)} for {self.label(rival)}: {gain:.1f} nats where exact")
+                    instead = self.settle_on(self.conclude((*others, rival), selection.threshold), selection.threshold)
+                    if any(found.term == rival.term for found in instead.fit.instances):
+                        return instead
+            self.problem, self._point = here  # the selection is exact there
         return selection
+
+    def _is_strained(self, fit: Fit) -> bool:
+        """Whether some number of the description has moved so far that the first order of other effects leads nowhere."""
+        numbers = zip(self.problem.nuisances, fit.mean, strict=False)
+        return any(abs(float(mean)) > FAR_MOVED * number.deviation for number, mean in numbers if not number.loose)
+
+    def _alike_from_description(
+        self, selection: Selection, others: tuple[Instance, ...], own: Instance
+    ) -> tuple[tuple[RegressionProblem, None], list[Instance]]:
+        """Where the problem is exact at the description, and what the library says looks like an effect on its target."""
+        terms, problem = self.problem.terms, self.description
+        mine, known = terms[own.term], all_effects().get(terms[own.term].effect)
+        regression = selection.regression.moved(problem)
+        found = []
+        for k, term in enumerate(terms if known is not None and mine.is_curved else ()):
+            assert known is not None
+            if term.effect not in known.look_alikes or term.target != mine.target or not term.is_curved:
+                continue
+            candidates = regression.scan(others, only=[k])[0]
+            if candidates and math.isfinite(candidates[0].gain) and not self.repeats(candidates[0].instance, others):
+                found.append(refined_shape(regression, others, candidates[0].instance))
+        return (problem, None), found
 
     def _alike(self, selection: Selection, others: tuple[Instance, ...], own: Instance) -> list[Instance]:
         """Effects that do an effect's work nearly as well, to the first order of one of the two."""

@@ -6,6 +6,7 @@ far off are compared with effects there, and not at the description.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -176,18 +177,24 @@ class ExactProblem:
 
     def _exact_evidence(self, regression: WhitenedRegression, fit: Fit) -> float:
         """Log evidence of a set where it is exact, and its columns with it: what is reached there, not what is promised."""
-        here, reached = (self.problem, self._point), -math.inf
+        return self._reached(regression, fit)[0]
+
+    def _reached(self, regression: WhitenedRegression, fit: Fit) -> tuple[float, FloatArray]:
+        """The same, and the whitened residual there."""
+        here, reached, left = (self.problem, self._point), -math.inf, regression.whitened_residual(fit)
         for _ in range(EXACT_ROUNDS):
             if not self._exact_at(fit):
                 break
             self.problem = self.problem.derived()
             regression = regression.moved(self.problem)
             fit = regression.fit(fit.instances)
-            missing = self._point_of(fit) - fit.mean
+            point = self._point_of(fit)
+            missing = point - fit.mean
             promised = fit.log_evidence
             there = promised - 0.5 * float(missing @ np.linalg.solve(fit.covariance, missing))
-            reached = max(reached, there)
+            if there > reached:
+                reached, left = there, regression.whitened_residual(dataclasses.replace(fit, mean=point))
             if promised - there < STEADY_EVIDENCE:
                 break
         self.problem, self._point = here
-        return reached if math.isfinite(reached) else fit.log_evidence
+        return (reached if math.isfinite(reached) else fit.log_evidence), left

@@ -29,7 +29,7 @@ from pcw_description.effects.registry import get
 from .effect_gates import EffectGates
 from .evidence_selection import EffectSearch, Selection
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
-from .regression_problem import HEALTHY, FloatArray, RegressionProblem, Term
+from .regression_problem import HEALTHY, STRAINED, FloatArray, RegressionProblem, Term
 from .selection_settings import SelectionSettings
 from .set_growth import Progress
 from .shape_search import refined_shape, shape_interval
@@ -41,8 +41,8 @@ AMBIGUOUS = 3.0
 REFINEMENT_LOG_PRIOR = -3.0
 # Half-width of 95 % of a Gaussian, in deviations.
 HALF_WIDTH = 1.96
-# So many tolerances are no healthy robot's; an effect that hides behind a number leaves less than this part of its square.
-STRAINED, RELIEF = 4.0, 0.5
+# An effect that hides behind a number leaves less than this part of its strain's square.
+RELIEF = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +202,7 @@ def search_effects(
 
     A number that strains its tolerance costs less than an effect has to explain: a payload hides behind a mass that is off by
     ten times what it may be. What is found counts if it relieves the numbers, and explains more than what was found before.
+    Fewer effects count also if they explain hardly less: what undoes effects that are too large fits the model's own errors.
     """
     search = EffectSearch(problem, rng, settings, progress)
     selection = search.run()
@@ -217,7 +218,9 @@ def search_effects(
     relief = sum(there[name] ** 2 for name in strained) / sum(here[name] ** 2 for name in strained)
     gain = again.advantage(instead, selection.fit.instances)
     progress(f"strains left {relief:.2f} of them, {gain:.1f} nats more")
-    return (again, instead) if relief < RELIEF and gain > instead.threshold else (search, selection)
+    fewer = len(instead.fit.instances) < len(selection.fit.instances)
+    wanted = -again.settings.least_peculiar if fewer else instead.threshold
+    return (again, instead) if relief < RELIEF and gain > wanted else (search, selection)
 
 
 def _strains(problem: RegressionProblem, fit: Fit) -> dict[str, float]:
@@ -247,7 +250,7 @@ def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection
 def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
     """Return the explanation by these effects alone: fitted again, and what is left tested again."""
     search, threshold = explanation.search, explanation.selection.threshold
-    selection = search.balanced(search.retuned_away(search.conclude(instances, threshold)))
+    selection = search.balanced(search.bounded(search.retuned_away(search.conclude(instances, threshold))))
     instances = selection.fit.instances
     result = OpenSetTest(search, selection.fit.instances).run(threshold)
     return dataclasses.replace(
@@ -490,6 +493,8 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     without = regression.fit(others)
     rivals = [without.log_evidence - fit.log_evidence]
     alike = []
+    # Far from where the problem is exact now, a first order says little of a rival: what it reached where it is exact counts.
+    where_exact = {rival: odds for (named, rival), odds in search.where_exact.items() if named == own.term}
     for position, refined in _refinements(problem, others):
         trial = regression.fit(refined)
         difference = trial.log_evidence + REFINEMENT_LOG_PRIOR - fit.log_evidence
@@ -517,11 +522,21 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
         difference = trial.log_evidence - ours.log_evidence
         if not (mine.once or theirs.once):  # what happens once is in one piece of the recording
             difference = regression.log_odds(trial, ours)
+        difference = max(difference, where_exact.pop(candidate.instance.term, -math.inf))
         rivals.append(difference)
         if difference > -AMBIGUOUS:
-            alike.append(theirs.effect if theirs.effect != mine.effect else theirs.key)
+            alike.append(_called(mine, theirs))
+    for rival_term, odds in where_exact.items():
+        rivals.append(odds)
+        if odds > -AMBIGUOUS:
+            alike.append(_called(problem.terms[own.term], problem.terms[rival_term]))
     total = sum(math.exp(min(rival, 50.0)) for rival in rivals)
     return 1.0 / (1.0 + total), tuple(alike)
+
+
+def _called(own: Term, rival: Term) -> str:
+    """What a rival of an effect is called: by its name, or by its target, too, where only that differs."""
+    return rival.effect if rival.effect != own.effect else rival.key
 
 
 def _refinements(

@@ -3,10 +3,14 @@
 A set that grows term by term takes a delay of all motors for a lag of each: the first lag explains more than any one delay
 added to nothing, and no exchange of one term for another leads from four lags to one delay of all. So the terms of one effect
 on single casters are also offered together for one term on all of these, of the same effect or of one that looks like it.
+
+And two effects of one target that look alike may be one, in another shape: a payload at the wrong place and a centre of mass
+that makes up for it are a payload at the right place.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 from pcw_description.effects.registry import all_effects
@@ -39,3 +43,10 @@ def gatherings(
         ]  # fmt: skip
         if wider:
             yield tuple(i for i in instances if i not in alike), wider
+    for one, other in itertools.permutations(instances, 2):
+        known = all_effects().get(terms[one.term].effect)
+        mine, theirs = terms[one.term], terms[other.term]
+        if known is None or (mine.target, mine.axis) != (theirs.target, theirs.axis):
+            continue
+        if theirs.effect in known.look_alikes and theirs.resolution:
+            yield tuple(i for i in instances if i not in (one, other)), [other.term]

@@ -10,6 +10,8 @@ from pcw_description.robot_description import RobotDescription
 from .regression_problem import FloatArray
 
 SAME_STAMP = 1e-6  # [s]
+# Where stamps tremble, a command and a state are of the same time that are nearer than this part of the shorter interval.
+SAME_PART = 0.25
 LARGEST_GAP = 0.05  # [s]; an older command is not held any more
 # A motor follows its commands where what it reports is so many times the command.
 FOLLOWS = (0.8, 1.2)
@@ -23,7 +25,7 @@ def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray |
 
     What is reported at a stamp is the answer to the command before it. But who logs a state together with the torque that was
     computed from it gives both the same stamp: then what is reported is nearer to the command of its own stamp, which no
-    motor can obey before it was given.
+    motor can obey before it was given. Where stamps tremble, the same stamp is one a little before or after.
     """
     commands, joints = recording.joint_commands, recording.joint_states
     if commands is None or commands.effort is None or joints.effort is None or len(commands.stamp) < 2:
@@ -35,10 +37,15 @@ def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray |
         effort = np.clip(commands.effort[np.maximum(last, 0)], -robot.torque_limit, robot.torque_limit)
         return np.where(fresh[:, None, None], effort, np.nan)
 
-    before, at = held(joints.stamp - SAME_STAMP), held(joints.stamp + SAME_STAMP)
-    nearer = (joints.effort - before) ** 2 - (joints.effort - at) ** 2
-    nearer = nearer[np.isfinite(nearer)]
-    return at if nearer.sum() > SURE * np.sqrt(np.sum(nearer**2)) else before
+    same = SAME_PART * min(float(np.median(np.diff(series.stamp))) for series in (commands, joints))
+    found = held(joints.stamp - SAME_STAMP)
+    for offset in (-same, SAME_STAMP, same):
+        instead = held(joints.stamp + offset)
+        nearer = (joints.effort - found) ** 2 - (joints.effort - instead) ** 2
+        nearer = nearer[np.isfinite(nearer)]
+        if nearer.sum() > SURE * np.sqrt(np.sum(nearer**2)):
+            found = instead
+    return found
 
 
 def quiet_torque(robot: RobotDescription, recording: Recording) -> FloatArray | None:

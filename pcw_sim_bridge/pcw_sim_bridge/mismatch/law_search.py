@@ -2,7 +2,8 @@
 
 All hypotheses of `unknown_law` are screened on top of the named effects and in place of them. Screening takes the function
 of a slow argument as constant over the length of the channels' filter, so that one filtered column per site and factor
-serves all functions of all arguments. The best few are then fitted with exact columns, jointly with names and tolerances.
+serves all functions of all arguments; those of a joint's own speed, which is not slow, are filtered one by one. The best few
+are then fitted with exact columns, jointly with names and tolerances.
 
 A law counts if it beats the names, refined as far as they can be, by evidence and on held-out blocks, and moves the
 prediction by a part that matters. A name that it makes redundant is withdrawn, unless the name alone does most of what
@@ -12,6 +13,7 @@ the law does: friction that varies by a tenth with the steering angle is frictio
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -118,11 +120,12 @@ class LawSearch:
         trials = on_all_cores(lambda trial: self._pruned(residual, trial), trials)
         fits = on_all_cores(lambda trial: trial.search.whiten_at(residual).fit(trial.instances), trials)
         order = np.argsort([-fit.log_evidence for fit in fits])
-        best = next((trials[k] for k in order if not self._undoes_a_motor(trials[k].law, fits[k])), None)
+        weights = [fits[k].mean[-len(trial.instance.active) :] for k, trial in enumerate(trials)]
+        best = next((trials[k] for k in order if not self._undoes_a_motor(trials[k].law, weights[k])), None)
         return None if best is None else self._judged(best)
 
-    def _undoes_a_motor(self, law: Law, fit: Fit) -> bool:
-        """Whether a law, the last instance of a fit, takes away most of the motor's torque of which it is a function."""
+    def _undoes_a_motor(self, law: Law, weights: FloatArray) -> bool:
+        """Whether a law with weights (K,) takes away most of the motor's torque of which it is a function."""
         sites = self.problem.sites
         assert sites is not None
         torques: FloatArray | None = None
@@ -131,7 +134,7 @@ class LawSearch:
             if site not in law.sites or motor not in law.depends_on:
                 continue
             torques = law.torques(sites) if torques is None else torques
-            taken = torques[:, index] @ fit.mean[-torques.shape[2] :]
+            taken = torques[:, index] @ weights
             if np.sum(taken**2) > LARGEST_MOTOR_PART**2 * np.sum(sites.variables[motor] ** 2):
                 return True
         return False
@@ -143,9 +146,11 @@ class LawSearch:
         assert self.problem.sites is not None
         laws = [*hypotheses(self.problem.sites), *place_waves(self.problem, self.search.residual_of(self.names))]
         chosen: list[Law] = []
-        for gains in _Screen(self.search, laws).gains(list(dict.fromkeys([self.names, ()]))):
-            order = np.argsort(-gains)
-            chosen += [laws[k] for k in order[:FINALISTS] if gains[k] > 0.0]
+        for scores in _Screen(self.search, laws).scores(list(dict.fromkeys([self.names, ()]))):
+            ranked = sorted((k for k, (gain, _) in enumerate(scores) if gain > 0.0), key=lambda k: -scores[k][0])
+            # Any drag is also a function of the torque that overcomes it, which must not crowd out what it really is.
+            allowed = (laws[k] for k in ranked if not self._undoes_a_motor(laws[k], scores[k][1]))
+            chosen += itertools.islice(allowed, FINALISTS)
         return list(dict.fromkeys(chosen))
 
     # -- finalists ----------------------------------------------------------------------------------------------
@@ -253,6 +258,16 @@ class LawSearch:
         return guessed and self.search.whiten_at(left).peculiar(change) > self.search.settings.least_peculiar
 
 
+def _is_fast(law: Law) -> bool:
+    """Whether a law is a function of its own joint's speed alone, or with another's: that may change within a filter's length.
+
+    The speed itself as a factor would be filtered, and what it is multiplied by is slow.
+    """
+    own = {place.site.replace("torque", "velocity") for place in law.places}
+    names = {name for place in law.places for argument in place.arguments for name, _ in argument}
+    return bool(own & names) and all(place.factor == Factor() for place in law.places)
+
+
 def _same_place(law: Law, target: Sequence[str]) -> bool:
     """Whether a law acts where an effect does: at one of its casters, on the chassis, at the axis."""
     places = {site.partition("/")[2] if "/" in site and not site.startswith("chassis") else site for site in law.sites}
@@ -299,7 +314,7 @@ class _Screened:
         """Take columns (S, C) and weights (S, C), what is known (S C, k), what it leaves (S C,), its square, and how many rows
         count.
         """
-        self.total, self.rows = total, rows
+        self.total, self.rows, self._weight = total, rows, weight
         self._bases = {key: base * weight for key, base in bases.items()}
         self._known, self._target = known.reshape(*weight.shape, -1), target.reshape(weight.shape)
         self._own: dict[_Base, tuple[FloatArray, FloatArray]] = {}
@@ -325,6 +340,13 @@ class _Screened:
         return plain, cross, moment
 
 
+    def products_of(self, columns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the same of whole columns (S, C, F)."""
+        own = (columns * self._weight[:, :, None]).reshape(-1, columns.shape[2])
+        known, target = self._known.reshape(len(own), -1), self._target.ravel()
+        return own.T @ own, known.T @ own, own.T @ target
+
+
 class _Screen:
     """Scores of many laws at once, by weighted least squares of the channels that they can move."""
 
@@ -336,28 +358,34 @@ class _Screen:
         self._moved = np.flatnonzero(np.any([np.abs(b).max(axis=0) > 0.0 for b in self._bases.values()], axis=0))
         self._variables = {name: values[:: self.step] for name, values in self.problem.variables.items()}
         self._functions: dict[tuple[object, object], FloatArray] = {}
+        fast = [law for law in self.laws if _is_fast(law)]
+        self._exact = dict(zip(fast, on_all_cores(self._exact_columns, fast), strict=True))
 
-    def gains(self, sets: Sequence[tuple[Instance, ...]]) -> FloatArray:
-        """Return roughly the nats that each law gains beside each set (sets, laws), penalised for its number of functions.
+    def scores(self, sets: Sequence[tuple[Instance, ...]]) -> list[list[tuple[float, FloatArray]]]:
+        """Return roughly the nats that each law gains beside each set, penalised for its number of functions; and its weights.
 
         Without regard to the colour of the noise, and on every few samples only.
         """
         bases = {key: np.ascontiguousarray(base[:: self.step, self._moved]) for key, base in self._bases.items()}
-        return np.array([self._gains_beside(_Screened(bases, *self._beside(instances))) for instances in sets])
+        return [self._scores_beside(_Screened(bases, *self._beside(instances))) for instances in sets]
 
-    def _gains_beside(self, screened: _Screened) -> list[float]:
-        gains = []
+    def _scores_beside(self, screened: _Screened) -> list[tuple[float, FloatArray]]:
+        scores = []
         for law in self.laws:
-            functions = [place.weight * self._of(law, place) for place in law.places]
-            keys = [(place.site, place.factor) for place in law.places]
-            plain, cross, moment = screened.products(keys, functions)
+            if law in self._exact:
+                plain, cross, moment = screened.products_of(self._exact[law])
+            else:
+                functions = [place.weight * self._of(law, place) for place in law.places]
+                keys = [(place.site, place.factor) for place in law.places]
+                plain, cross, moment = screened.products(keys, functions)
             gram = plain - cross.T @ cross
             # A function that is nowhere at work, or that the tolerances make, must not be blown up.
             gram[np.diag_indices_from(gram)] += 1e-6 * np.diag(plain) + 1e-12 * np.trace(plain) + 1e-300
-            explained = min(float(moment @ np.linalg.solve(gram, moment)), 0.999999 * screened.total)
+            weights = np.asarray(np.linalg.solve(gram, moment), dtype=np.float64)
+            explained = min(float(moment @ weights), 0.999999 * screened.total)
             gain = -0.5 * screened.rows * np.log1p(-explained / screened.total)
-            gains.append(float(gain - 0.5 * len(moment) * np.log(screened.rows)))
-        return gains
+            scores.append((float(gain - 0.5 * len(moment) * np.log(screened.rows)), weights))
+        return scores
 
     def _beside(self, instances: tuple[Instance, ...]) -> tuple[FloatArray, FloatArray, FloatArray, float, float]:
         """Weights, what tolerances and set span, what they leave, its square, and independent rows, for one set."""
@@ -394,6 +422,9 @@ class _Screen:
             columns = self.sites.columns(torques)
             found |= {key: columns[:, :, k] for k, key in enumerate(keys)}
         return found
+
+    def _exact_columns(self, law: Law) -> FloatArray:
+        return np.ascontiguousarray(self.sites.columns(law.torques(self.sites))[:: self.step, self._moved])
 
     def _of(self, law: Law, place: Place) -> FloatArray:
         key = (law.basis, place.arguments)

@@ -21,7 +21,7 @@ import numpy as np
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
-from .law_search import FoundLaw, LawSearch
+from .law_search import LAW_MARGIN, FoundLaw, LawSearch
 from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem
@@ -33,10 +33,11 @@ HAT_KNOTS = 9
 HARMONICS = 3
 # A function of one variable must take this part of what is left of a channel to be worth a report.
 SMALLEST_SHARE = 0.10
-SMALLEST_GAIN = 10.0  # nats, on top of the threshold of the names
 # It must also reach this part of the measured signal. Below lie details that no description of a real machine holds (the
 # lean on its springs, the ripple of a filter); a tool that reports them on every healthy robot says nothing.
 SMALLEST_PART = 0.02
+# So many deviations of what the model misjudges are more than that.
+BEYOND_DOUBT = 2.0
 # No wheel is rounder, and no floor is more even, than that what it rolls is known better than to this part of its way.
 ROUNDNESS = 2e-4
 LARGEST_LAWS = 2
@@ -228,7 +229,7 @@ def _with_law(
     """Fit names and law jointly."""
     problem = search.problem.with_terms([law.term(search.problem)])
     wider = EffectSearch(problem, search.rng, search.settings, search.progress)
-    wider.noise_gain, wider.ladder = search.noise_gain, search.ladder
+    wider.noise_gain, wider.ladder, wider.where_exact = search.noise_gain, search.ladder, search.where_exact
     instance = Instance(len(problem.terms) - 1, (), tuple(range(len(problem.terms[-1].parameters))))
     return wider, wider.conclude((*names, instance), selection.threshold)
 
@@ -365,14 +366,14 @@ class OpenSetTest:
             return None
         smallest = SMALLEST_PART * float(np.std(self.problem.measured[valid, channel]))
         if self.problem.misjudged is not None:  # what the model cannot judge is no finding either
-            smallest = max(smallest, float(np.sqrt(np.mean(self.problem.misjudged[valid, channel] ** 2))))
+            smallest = max(smallest, BEYOND_DOUBT * float(np.sqrt(np.mean(self.problem.misjudged[valid, channel] ** 2))))
         if self.problem.channels[channel].name.startswith("rolling_consistency"):
             smallest = max(smallest, ROUNDNESS * float(np.sqrt(np.mean(self.problem.variables["speed"][valid] ** 2))))
         for name in self._promising(channel):
             functions, knots = self.bases[channel, name]
             gain, share, curve = self._dependence(channel, name, functions, knots, instances)
             size = np.sqrt(share) * float(np.sqrt(np.mean(self.residual[valid, channel] ** 2)))
-            passes = gain > threshold + SMALLEST_GAIN and share > SMALLEST_SHARE and size > smallest
+            passes = gain > threshold + LAW_MARGIN and share > SMALLEST_SHARE and size > smallest
             if passes and (best is None or gain > best.gain):
                 best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
         return best

@@ -34,7 +34,8 @@ LEAST_PROBABILITY = 0.01  # of a name: below it stands for another one
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
 LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to speak against an effect
-TELLING_PART = 0.1  # of the description's error in a simulation; below it no effect is told from numbers that were re-tuned
+# Of the description's error in a simulation; what adds less to the error is not told from numbers that were re-tuned.
+TELLING_PART = 0.1
 LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
@@ -272,7 +273,9 @@ class Prover:
             errors = _rollout_errors(windows, before, with_it, self.rng, everywhere).pooled()
             nominal = np.where(away[:, None, None], np.nan, self.before)
             described = _rollout_errors(windows, nominal, nominal, self.rng, everywhere).pooled()
-            harms.append((float(errors.worse(TELLING_PART**2 * described.before)[0]), index))
+            added = float(errors.after[0] - errors.before[0])
+            if added > TELLING_PART**2 * float(described.before[0]):
+                harms.append((float(errors.worse()[0]), index))
         worst, index = max(harms, default=(0.0, 0))
         return (index, "the simulation follows less well with it") if worst > 0.0 else None
 

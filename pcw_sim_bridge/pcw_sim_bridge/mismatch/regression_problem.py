@@ -31,7 +31,8 @@ WEAKER, POWERS = 0.8, (0.5, 3.0)
 NEARBY = 0.01  # part of its size by which an effect is changed for its derivative there
 PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
-HEALTHY = 3.0  # tolerances
+# Tolerances beyond which a number is not a healthy system's, and beyond which none of a hundred numbers is by chance.
+HEALTHY, STRAINED = 3.0, 4.0
 
 UNKNOWN = "unknown"  # reserved in the vocabulary for what no entry explains
 

@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy import signal
 
 from pcw_description.compiled import ARRAY_SIGNATURE, compiled_for_kernel
 from pcw_description.effect_instance import EffectInstance
@@ -150,12 +151,20 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
     rotor = (rotors.drive, rotors.steer)[axis] * diagonal[axis] ** 2
     shaft = motion.quiet_torque[:, i] @ np.linalg.inv(coupling)
     torque = shaft[:, axis] - rotor * (motion.acceleration[:, i] @ coupling[axis])
-    ahead = torque / gear.stiffness
+    ahead = _lagging(torque / gear.stiffness, gear.damping / gear.stiffness * motion.rate)
     if gear.play > 0.0:
         ahead = ahead + 0.5 * gear.play * _flank(torque)
     smooth = SignalFilter(motion.rate, motion.cutoff).smooth(ahead)
     moved: FloatArray = smooth[:, None] * np.linalg.inv(coupling)[:, axis]
     return moved
+
+
+def _lagging(values: FloatArray, lag: float) -> FloatArray:
+    """What follows values (T,) with a time constant of `lag` samples: the twist of a spring that is damped."""
+    denominator = [1.0 + 2.0 * lag, 1.0 - 2.0 * lag]
+    start = signal.lfiltic([1.0, 1.0], denominator, y=values[:1], x=values[:1])
+    followed: FloatArray = signal.lfilter([1.0, 1.0], denominator, values, zi=start)[0]
+    return followed
 
 
 def _flank(torque: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
 
 from .held_commands import quiet_torque
 from .regression_problem import BoolArray, FloatArray
-from .signal_filter import SignalFilter, derivative, uniform_segments, white_noise_level
+from .signal_filter import SignalFilter, derivative, interpolated, uniform_segments, white_noise_level
 from .wheel_shaking import wheel_shaking
 
 LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
@@ -31,8 +31,8 @@ ALLOWED_DERIVATIVE_NOISE = 0.05
 # Torques tell something where they hold so many times the power that they have in a band where there is noise only [Hz].
 TORQUE_OVER_NOISE, TORQUE_NOISE_BAND = 3.0, (12.0, 40.0)
 PIECE, LEAST_PIECES = 2.0, 4  # [s]; of a spectrum
-LARGEST_GAP, LARGEST_GAP_PERIODS = 0.05, 3.0  # [s], or so many periods of slow joint_states
-LARGEST_TRACKER_GAP = 0.25  # [s]; trackers are slower than joints
+LARGEST_GAP = 0.05  # [s]; of joints and IMU
+LARGEST_TRACKER_GAP = 0.1  # [s]
 SHORTEST_SEGMENT = 1.0  # [s]
 
 
@@ -90,20 +90,11 @@ def read_motions(
     n = robot.n
     torque = joints.effort if joints.effort is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([joints.position.reshape(-1, 2 * n), torque.reshape(-1, 2 * n)], axis=1)
-    imu = np.full((len(signals), 3), np.nan)
-    if recording.imu is not None:
-        measured = np.column_stack([recording.imu.gyro[:, 2], recording.imu.acceleration[:, :2]])
-        for column in range(3):
-            imu[:, column] = np.interp(
-                joints.stamp, recording.imu.stamp, measured[:, column], left=np.nan, right=np.nan
-            )
     quiet = quiet_torque(robot, recording)
     quiet = torque if quiet is None else quiet
     speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
-    more = [_tracked_pose(recording, joints.stamp), quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n)]
-    signals = np.concatenate([signals, imu, *more], axis=1)
-    largest_gap = max(LARGEST_GAP, LARGEST_GAP_PERIODS * float(np.median(np.diff(joints.stamp))))
-    rate, pieces = uniform_segments(joints.stamp, signals, largest_gap)
+    signals = np.concatenate([signals, quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n)], axis=1)
+    rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
     step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
     for stamps, values in pieces:
@@ -112,8 +103,9 @@ def read_motions(
         for start, stop in _runs(np.asarray(finite, dtype=bool)):
             if stamps[stop - 1] - stamps[start] < SHORTEST_SEGMENT:
                 continue
-            block = values[start:stop]
-            smooth = wide.smooth(np.where(np.isfinite(block), block, 0.0))
+            sensed_there = [_measured_motion(recording, stamps[start:stop]), _tracked_pose(recording, stamps[start:stop])]
+            block = np.concatenate([values[start:stop, : 4 * n], *sensed_there, values[start:stop, 4 * n :]], axis=1)
+            smooth = wide.smooth(_bridged(block))
             position = smooth[:, : 2 * n].reshape(-1, n, 2)
             velocity = derivative(position, rate)
             torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
@@ -148,21 +140,34 @@ def read_motions(
     return motions
 
 
+def _bridged(values: FloatArray) -> FloatArray:
+    """Values (T, S) with lines over what is not finite, so that a filter does not ring at its ends; zeros where nothing is."""
+    bridged = values.copy()
+    rows = np.arange(len(values))
+    for column in bridged.T:
+        known = np.isfinite(column)
+        if not known.all():
+            column[:] = np.interp(rows, rows[known], column[known]) if known.any() else 0.0
+    return bridged
+
+
+def _measured_motion(recording: Recording, stamps: FloatArray) -> FloatArray:
+    """Yaw rate and acceleration x, y of the IMU (T, 3) at stamps; NaN where none were recorded."""
+    imu = recording.imu
+    if imu is None or len(imu.stamp) < 2:
+        return np.full((len(stamps), 3), np.nan)
+    measured = np.column_stack([imu.gyro[:, 2], imu.acceleration[:, :2]])
+    return interpolated(stamps, imu.stamp, measured, LARGEST_GAP)
+
+
 def _tracked_pose(recording: Recording, stamps: FloatArray) -> FloatArray:
-    """Tracked pose (T, 3) at the stamps of the joints, its yaw without jumps; NaN where it was not recorded."""
+    """Tracked pose (T, 3) at stamps, its yaw without jumps; NaN where it was not recorded."""
     truth = recording.ground_truth
-    pose = np.full((len(stamps), 3), np.nan)
     if truth is None or len(truth.stamp) < 2:
-        return pose
+        return np.full((len(stamps), 3), np.nan)
     tracked = truth.pose.copy()
     tracked[:, 2] = np.unwrap(tracked[:, 2])
-    for column in range(3):
-        pose[:, column] = np.interp(stamps, truth.stamp, tracked[:, column], left=np.nan, right=np.nan)
-    # Over a pause of the tracker there is no pose, however near a line may come to it.
-    pauses = np.flatnonzero(np.diff(truth.stamp) > LARGEST_TRACKER_GAP)
-    for index in pauses:
-        pose[(stamps > truth.stamp[index]) & (stamps < truth.stamp[index + 1])] = np.nan
-    return pose
+    return interpolated(stamps, truth.stamp, tracked, LARGEST_TRACKER_GAP)
 
 
 def tracked_place(robot: RobotDescription) -> FloatArray:

@@ -246,10 +246,12 @@ class _TermMaker:
         return dataclasses.replace(parameter, lower=float(np.clip(softest, parameter.lower, parameter.typical)))
 
     def _searched(self, effect: Effect) -> tuple[EffectParameter, ...]:
-        """The parameters of an effect that are searched for; of clocks that of the tracker where no IMU has one."""
-        if isinstance(effect, ClockEffect) and self.layout.pose and not self.layout.imu:
-            return tuple(p for p in effect.parameters if effect.offset("ground_truth/odom", _only(effect, p)) != 0.0)
-        return effect.searched_parameters
+        """The parameters of an effect that are searched for; of clocks those of the sensors that are there."""
+        if not isinstance(effect, ClockEffect):
+            return effect.searched_parameters
+        there = {"imu/data": self.layout.imu, "ground_truth/odom": self.layout.pose}
+        topics = [topic for topic, is_there in there.items() if is_there]
+        return tuple(p for p in effect.parameters if any(effect.offset(topic, _only(effect, p)) for topic in topics))
 
     def _room(self, columns: FloatArray) -> FloatArray:
         """Coefficients (P,) with which columns (T, C, P) are as large as all that the description leaves in some channel."""

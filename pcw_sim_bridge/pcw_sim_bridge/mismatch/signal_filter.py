@@ -15,11 +15,17 @@ from scipy import interpolate, signal, sparse
 
 from pcw_description.compiled import compiled
 
-from .regression_problem import FloatArray
+from .regression_problem import BoolArray, FloatArray
 
 FILTER_ORDER = 4
 # Samples per period of the cut-off after decimation: the stop band that whitening would have to blow up again stays small.
 OVERSAMPLING = 2.5
+# A step of more median ones than the first is a gap, as samples are missing in it; one of the second may always be filled.
+GAP_STEPS, FILLED_STEPS = 1.5, 3.0
+# So much of what belongs on either side of a gap, as long as it, must be there to fill it.
+SURROUNDED = 0.5
+# Samples that are so many times rarer than what is asked for are a slow sensor's.
+SLOW_STEPS = 1.5
 # Central differences of eighth order: exact to 0.1 % up to a fifth of the sampling rate.
 _STENCIL = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0.0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 
@@ -165,18 +171,18 @@ def white_noise_level(values: FloatArray) -> float:
 def uniform_segments(
     time: FloatArray, signals: FloatArray, largest_gap: float
 ) -> tuple[float, list[tuple[FloatArray, FloatArray]]]:
-    """Cut at gaps and put each piece on a uniform grid by linear interpolation.
+    """Cut at gaps and put each piece on a uniform grid, see `interpolated`.
 
     Args:
         time: increasing stamps (T,) [s].
         signals: (T, S).
-        largest_gap: a longer step cuts [s].
+        largest_gap: see `_is_pause` [s].
 
     Returns:
         The rate [Hz] and the pieces (stamps (T_i,), signals (T_i, S)).
     """
     step = float(np.median(np.diff(time)))
-    cuts = np.flatnonzero(np.diff(time) > max(largest_gap, 2.5 * step)) + 1
+    cuts = np.flatnonzero(_is_pause(time, largest_gap)) + 1
     # The mean step of the pieces, not the median: over a minute the difference of the two is a drift.
     steps = np.delete(np.diff(time), cuts - 1)
     rate = 1.0 / float(np.mean(steps))
@@ -189,6 +195,59 @@ def uniform_segments(
         if len(grid) == len(stamps) and np.max(np.abs(grid - stamps)) < 0.01 / rate:
             pieces.append((grid, values))
             continue
-        columns = [np.interp(grid, stamps, values[:, column]) for column in range(values.shape[1])]
-        pieces.append((grid, np.stack(columns, axis=1)))
+        pieces.append((grid, _without_pause(grid, stamps, values, GAP_STEPS * step, False)))
     return rate, pieces
+
+
+def interpolated(grid: FloatArray, time: FloatArray, values: FloatArray, largest_gap: float) -> FloatArray:
+    """Values (T', S) at the times `grid` (T',): between samples on lines, or on a spline where they are much rarer.
+
+    A line cuts a bend by more than the noise of an encoder over a gap of ten samples, and a slow sensor's signal everywhere.
+    In a gap stands a cubic that is fitted to as long a time on either side as the gap lasts, so that it averages noise.
+
+    Args:
+        grid: increasing [s].
+        time: increasing stamps (T,) [s]; values: (T, S).
+        largest_gap: see `_is_pause`; in a pause, before the first sample and after the last one, values are NaN [s].
+    """
+    step = float(np.median(np.diff(time)))
+    spline = len(grid) > 1 and step > SLOW_STEPS * float(np.median(np.diff(grid)))
+    result = np.full((len(grid), values.shape[1]), np.nan)
+    for index in np.split(np.arange(len(time)), np.flatnonzero(_is_pause(time, largest_gap)) + 1):
+        inside = slice(*np.searchsorted(grid, time[index[[0, -1]]] + [0.0, 1e-9]))
+        result[inside] = _without_pause(grid[inside], time[index], values[index], GAP_STEPS * step, spline)
+    return result
+
+
+def _without_pause(grid: FloatArray, time: FloatArray, values: FloatArray, least_gap: float, spline: bool) -> FloatArray:
+    """The same between the first and the last sample, with gaps that are all to be filled."""
+    if spline and len(time) >= 4 and np.isfinite(values).all():
+        result = np.asarray(interpolate.CubicSpline(time, values)(grid))
+    else:
+        result = np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
+    for index in np.flatnonzero(np.diff(time) > least_gap):
+        start, stop = time[index], time[index + 1]
+        gap = stop - start
+        inside = slice(np.searchsorted(grid, start, side="right"), np.searchsorted(grid, stop))
+        before, after = np.searchsorted(time, [start - gap, stop + gap])
+        used = slice(max(0, min(before, index - 1)), max(after, index + 3))
+        there = np.isfinite(values[used]).all(axis=0)  # a signal that was not recorded leaves the others theirs
+        if len(time[used]) < 4:
+            continue
+        scaled = [(times - 0.5 * (start + stop)) / (1.5 * gap) for times in (time[used], grid[inside])]
+        known, wanted = (np.vander(times, 4) for times in scaled)
+        result[inside, there] = wanted @ np.linalg.lstsq(known, values[used][:, there], rcond=None)[0]
+    return result
+
+
+def _is_pause(time: FloatArray, largest_gap: float) -> BoolArray:
+    """Whether steps (T - 1,) between stamps are longer than what may be filled, or gaps with too few samples around them."""
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    pause: BoolArray = steps > max(largest_gap, FILLED_STEPS * step)
+    for index in np.flatnonzero(~pause & (steps > GAP_STEPS * step)):
+        gap = steps[index]
+        before = index + 1 - np.searchsorted(time, time[index] - gap)
+        after = np.searchsorted(time, time[index + 1] + gap, side="right") - (index + 1)
+        pause[index] = min(before, after) < SURROUNDED * gap / step
+    return pause

@@ -332,14 +332,22 @@ class WhitenedRegression:
         return covariance
 
     def log_odds(self, other: Fit, fit: Fit) -> float:
-        """Log odds of one set against another that has more evidence, no surer than the recording's pieces agree on them.
+        """Log odds of one set against another that has more evidence; see `odds`."""
+        left, other_left = self.whitened_residual(fit), self.whitened_residual(other)
+        return self.odds(other.log_evidence - fit.log_evidence, left, other_left)
+
+    def odds(self, difference: float, left: FloatArray, other_left: FloatArray) -> float:
+        """Log odds of a set that has so much more evidence than another, no surer than the recording's pieces agree on them.
+
+        Args:
+            difference: in evidence [nats]; below zero where the other set is the better one.
+            left, other_left: what the other one and it leave, whitened by this regression's noise (N,).
 
         Evidence adds up advantages as if one of the two were exact. Where neither is, one describes this piece better and
         the other that one, and a sum of which the pieces make a large part by chance decides nothing.
         Source: Vuong, Econometrica 57 (1989): the sum against its own scatter; here by pieces, whose errors are related.
         """
-        difference = other.log_evidence - fit.log_evidence
-        advantage = self.whitened_residual(fit) ** 2 - self.whitened_residual(other) ** 2
+        advantage = left**2 - other_left**2
         time = self._flat // self.problem.residual.shape[1]
         _, piece = np.unique(time // max(round(PIECE * self.problem.rate), 1), return_inverse=True)
         pieces = np.bincount(piece, weights=0.5 * advantage)
@@ -373,10 +381,12 @@ class WhitenedRegression:
         error = float(np.sum(self.whitened_residual(fit) ** 2))
         return 0.5 * (error + float(np.sum((fit.mean / self.deviations(fit.instances)) ** 2)))
 
-    def tolerance_cost(self, fit: Fit) -> float:
-        """Half the squared distance of the description's numbers from nominal, in tolerances [nats]."""
-        count = len(self.problem.nuisances)
-        return 0.5 * float(np.sum((fit.mean[:count] / self.problem.nuisance_deviations()) ** 2))
+    def tolerance_cost(self, fit: Fit, firm: bool = False) -> float:
+        """Half the squared distance of numbers from the description [nats], in tolerances; firm: without loose ones."""
+        numbers = self.problem.nuisances
+        counted = np.array([not (firm and number.loose) for number in numbers], dtype=bool)
+        distances = fit.mean[: len(numbers)] / self.problem.nuisance_deviations()
+        return 0.5 * float(np.sum(distances[counted] ** 2))
 
     # -- scan ---------------------------------------------------------------------------------------------------
 
@@ -539,11 +549,12 @@ class WhitenedRegression:
         """Whether every parameter of a fit lies within its bounds."""
         return all(self.each_within_bounds(fit))
 
-    def each_within_bounds(self, fit: Fit) -> list[bool]:
-        """Whether all parameters of an instance lie within their bounds, per instance."""
+    def each_within_bounds(self, fit: Fit, strictly: bool = False) -> list[bool]:
+        """Whether all parameters of an instance lie within their bounds, per instance; strictly: a first order's, too."""
         position, within = self.nuisance.shape[1], []
         for instance in fit.instances:
-            parameters, room = self.problem.terms[instance.term].parameters, self._room(instance.term)
+            parameters = self.problem.terms[instance.term].parameters
+            room = 1.0 if strictly else self._room(instance.term)
             means = fit.mean[position : position + len(instance.active)] / room
             within.append(
                 all(parameters[k].lower <= mean <= parameters[k].upper for k, mean in zip(instance.active, means, strict=True))
