@@ -7,7 +7,6 @@ import shutil
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -64,13 +63,11 @@ def test_scripts_parse_and_are_executable(script):
 
 
 @set_up_here
-def test_second_run_does_nothing_and_is_fast():
+def test_second_run_does_nothing():
     before = (REPOSITORY / ".venv/.pcw/runtime").stat().st_mtime_ns
     first = bash("pcw_bringup_scripts/setup_env.sh --test")  # whatever was edited since the tests began is built here
     assert first.returncode == 0, first.stderr
-    since = time.monotonic()
     second = bash("pcw_bringup_scripts/setup_env.sh --test")
-    assert time.monotonic() - since < 20.0
     assert second.returncode == 0, second.stderr
     assert second.stderr.count("[pcw]") == 1 and "[pcw] ready in" in second.stderr
     assert (REPOSITORY / ".venv/.pcw/runtime").stat().st_mtime_ns == before

@@ -1,6 +1,7 @@
 """The controller as a process over real DDS: it drives, and it lets go of the robot whenever in doubt."""
 
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -427,7 +428,9 @@ def test_the_latency_is_measured_and_printed(ros):
     measured = ros.start("pcw_control.nodes.command_latency", "-p", "cycles:=200")
     assert measured.wait() == 0
     assert "p99" in measured.log and " 0 of 200 without an answer" in measured.log
-    assert " 0 with torque" not in measured.log
+    # Of the 700 questions those before the first cmd_vel need none: it comes with the first, and discovery takes its time.
+    (driven,) = re.findall(r"(\d+) with torque", measured.log)
+    assert int(driven) >= 200
 
 
 def test_the_first_name_still_starts_it(ros):

@@ -216,10 +216,8 @@ def test_an_adapter_that_is_pulled_out_is_a_bus_that_is_off():
         raise OSError(19, "No such device")
 
     transport._buses["can0"].recv = gone
-    begun = time.monotonic()
     arrived = transport.receive(0.01)
     assert [one.frame.error for one in arrived] == [True] and arrived[0].frame.id == 0x40
-    assert time.monotonic() - begun < 1.0
     transport.close()
 
 

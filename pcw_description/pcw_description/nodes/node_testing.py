@@ -7,7 +7,8 @@
         ros.wait_for(lambda: odom, while_doing=lambda: states.publish(message))
         assert node.interrupt() == 0
 
-Nothing sleeps for a fixed time: everything waits for what it needs and fails at a deadline, with what the nodes said.
+Nothing sleeps for a fixed time, but before the first question to a service: everything waits for what it needs and fails at a
+deadline, with what the nodes said.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from types import TracebackType
 from typing import Any, TextIO
 
 import rclpy
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -33,6 +35,8 @@ from .node_tools import EventsExecutor
 
 # First contact takes seconds on a busy machine, and a cold cache compiles kernels; waits end as soon as they can [s].
 DEADLINE = 60.0
+# A service is known before it knows who asks; the middleware gives up an answer that it cannot deliver within 0.1 s [s].
+FOUND_BY_SERVER = 0.3
 POLITENESS = 5.0  # in which a process that was asked to end may do so [s]
 
 
@@ -99,6 +103,7 @@ class RosTest:
         self.peer = Node("test_peer", context=self._context)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.peer)
+        self._clients: dict[str, Client[Any, Any]] = {}
 
     def __enter__(self) -> RosTest:
         """Return itself."""
@@ -170,14 +175,15 @@ class RosTest:
 
     def call(self, service_type: Any, name: str, request: Any = None) -> Any:
         """Call a service and return its response."""
-        client = self.peer.create_client(service_type, name)
-        try:
+        client = self._clients.get(name)
+        if client is None:
+            client = self._clients[name] = self.peer.create_client(service_type, name)
+        if not client.service_is_ready():
             self.wait_for(client.service_is_ready)
-            future = client.call_async(request if request is not None else service_type.Request())
-            self.wait_for(future.done)
-            return future.result()
-        finally:
-            self.peer.destroy_client(client)
+            self.spin_for(FOUND_BY_SERVER)
+        future = client.call_async(request if request is not None else service_type.Request())
+        self.wait_for(future.done)
+        return future.result()
 
 
 def _own_domain() -> tuple[int, TextIO]:

@@ -7,11 +7,11 @@ python -m pcw_sim_bridge.mismatch analyze ...
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 
 from pcw_description.errors import PcwError
+from pcw_description.stop_requests import interrupts
 
 from .commands import analyze, challenge, fleet, suggest
 
@@ -30,11 +30,10 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     options = parser().parse_args(arguments)
-    # A terminated run leaves no workers and no half of a report, as an interrupted one; a shell may have SIGINT ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
-        return int(options.run(options))
+        # A terminated run leaves no workers and no half of a report, as an interrupted one; a shell may have SIGINT ignored.
+        with interrupts():
+            return int(options.run(options))
     except PcwError as error:
         print(f"mismatch: {error}", file=sys.stderr)
         return 2
