@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
+from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.fleet import FleetResults, FleetRobots, Task, analyse_all, find_tasks
 from pcw_sim_bridge.mismatch.fleet_report import fleet_html, write_fleet_report
@@ -269,19 +270,19 @@ def test_recordings_of_robots_are_found_dated_and_given_to_their_robots(tmp_path
         (["logs/bad.csv", "--robot", "sled.yaml"], "none of the 1 recordings could be analysed"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], says: str) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], arguments: list[str], says: str
+) -> None:
     """What is wrong is named, and there is no report."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "sled.yaml").write_text(SLED)
     (tmp_path / "logs").mkdir()
     (tmp_path / "empty").mkdir()
     (tmp_path / "logs" / "bad.csv").write_text("these are\nno numbers\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "pcw_sim_bridge.mismatch", "fleet", *arguments, "--out", "out", "--quiet"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
-    )
-    assert done.returncode == 2
-    assert says in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    assert main(["fleet", *arguments, "--out", "out", "--quiet"]) == 2
+    errors = capfd.readouterr().err
+    assert says in errors
+    assert len(errors.splitlines()) == 1
     assert not (tmp_path / "out" / "fleet.json").exists()
 
 
