@@ -13,7 +13,7 @@ from types import FrameType
 from typing import Any
 
 INSISTENT = 1.0  # a signal so long after the first [s] ends what does not look
-# When an interrupt is tried again that is put off, and one that got nowhere [s]. What it unwinds may take as long: workers end.
+# When an interrupt is tried again that is put off, and one that got nowhere [s]; workers that it ends may take as long.
 PUT_OFF, SWALLOWED = 0.02, 3.0
 # An error from outside that begins here leaves a lock closed: other threads that compile would wait for ever.
 LOCKS = ("numba.core.compiler_lock", "llvmlite.binding.ffi")
@@ -52,7 +52,7 @@ def interrupts() -> Iterator[None]:
     It is put off where Python would only report an error and go on (`__del__`), and where an error from outside leaves a
     lock closed. Callbacks of compiled code may still swallow it, so it is raised again until the context is left.
     """
-    before: dict[int, Any] = {}
+    before: dict[signal.Signals, Any] = {}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if signal.SIGALRM not in before:  # the clock belongs to whoever uses it until there is need of it
