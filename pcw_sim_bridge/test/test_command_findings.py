@@ -1,6 +1,7 @@
 """Between command and torque: lags and dead times of single joints, and what all joints of an axis have alike."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.command_findings import command_findings
+from pcw_sim_bridge.mismatch.command_findings import command_findings, with_rivals
 from pcw_sim_bridge.mismatch.command_tracking import command_problems
+from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
 # Its joint states come at 300 Hz, so that commands are held over 3, 3 and 4 ms in turn.
 ROBOT = load_robot("dyros_pcv")
@@ -35,6 +38,30 @@ def test_what_all_steerings_have_alike_is_one_effect_with_its_name(effect, param
     [place] = findings.locations
     assert place.casters == ROBOT.caster_names and len(place.channels) == ROBOT.n
     assert other not in named.ambiguous_with
+
+
+@pytest.mark.parametrize(("part_of_a_delay", "doubted"), [(90.0, True), (-2.0, True), (-20.0, False)])
+def test_what_a_part_of_another_effect_explains_as_well_is_named_with_it(part_of_a_delay, doubted):
+    """A dead time of 2.1 ms at 300 Hz shows in a part of the samples; two of four drives were given a lag, p = 1."""
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), ())
+    problem = command_problems(ROBOT, [recording])[0]
+    lag, delay = ([term.effect for term in problem.terms].index(f"actuator_{kind}") for kind in ("lag", "delay"))
+    instance = Instance(lag, (("time_constant", 0.0014),), problem.terms[lag].base_indices())
+    best = problem.terms[delay].shapes[3]
+
+    def fit(instances):
+        found = [i for i in instances if i.term == delay and dict(i.shape) == best]
+        return SimpleNamespace(log_evidence=100.0 + part_of_a_delay if found else 0.0)
+
+    named = NamedTerm(instance, problem.terms[lag], {}, 0.98, (), 100.0, 100.0, np.zeros((1, 1)))
+    selection = SimpleNamespace(
+        fit=SimpleNamespace(instances=(instance,), log_evidence=100.0), regression=SimpleNamespace(fit=fit)
+    )
+    search, rest = SimpleNamespace(problem=problem), ((), (), None, (), np.zeros(1), np.ones(1))
+    explanation = Explanation(search, selection, (named,), *rest)  # type: ignore[arg-type]
+    [entry] = with_rivals(explanation).named
+    assert entry.ambiguous_with == (("actuator_delay",) if doubted else ())
+    assert entry.probability == pytest.approx(0.49 if doubted else 0.98)
 
 
 def test_one_joint_at_fault_is_named_alone():

@@ -14,13 +14,14 @@ from scipy import stats
 from pcw_description.effect_instance import EffectInstance
 
 from .evidence_selection import EffectSearch
-from .explanation import HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
+from .explanation import AMBIGUOUS, HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
 from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
 from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
-from .regression_problem import Channel, FloatArray, RegressionProblem
+from .regression_problem import UNKNOWN, Channel, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
+from .whitened_regression import Instance
 
 Progress = Callable[[str], None]
 # Numbers of several joints agree where chance alone would part them further once in so many.
@@ -65,7 +66,7 @@ def command_findings(
     for problem in problems:
         rng = np.random.default_rng(seed)
         channel = problem.channels[0]
-        explanation = None if _is_idle(problem, settings) else explain(problem, rng, settings)
+        explanation = None if _is_idle(problem, settings) else with_rivals(explain(problem, rng, settings))
         added, floor = np.zeros_like(problem.residual), _size(problem.residual)
         flagged = False
         if explanation is not None:
@@ -90,6 +91,34 @@ def command_findings(
             (*found.ladder, *_ladder(explanation)),
         )
     return _shared(found, [problem.channels[0] for problem in problems])
+
+
+def with_rivals(explanation: Explanation) -> Explanation:
+    """The explanation, with the rivals that its effects owe their names to not being present as a whole.
+
+    An effect is there as it is or not at all, and the search keeps to effects that come out so. But where one would explain
+    more with a part of it, as a dead time of less than a sampling period among stamps that tremble, neither of the two has the
+    right shape, and the name of the one that is kept is no better than that of the other.
+    """
+    fit, regression = explanation.selection.fit, explanation.selection.regression
+    terms, named = explanation.search.problem.terms, []
+    for entry in explanation.named:
+        others = tuple(instance for instance in fit.instances if instance != entry.instance)
+        taken = {instance.term for instance in fit.instances}
+        rivals = []
+        for index, term in enumerate(terms):
+            if index in taken or term.effect == UNKNOWN:
+                continue
+            shapes = (Instance(index, tuple(sorted(shape.items())), term.base_indices()) for shape in term.shapes)
+            best = max(regression.fit((*others, rival)).log_evidence for rival in shapes)
+            if best > fit.log_evidence - AMBIGUOUS and term.effect not in entry.ambiguous_with:
+                rivals.append(term.effect)
+        named.append(
+            dataclasses.replace(
+                entry, ambiguous_with=(*entry.ambiguous_with, *rivals), probability=entry.probability / (1 + len(rivals))
+            )
+        )
+    return dataclasses.replace(explanation, named=tuple(named))
 
 
 def _shared(found: CommandFindings, channels: Sequence[Channel]) -> CommandFindings:

@@ -37,6 +37,8 @@ LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to spe
 # Of the description's error in a simulation; what adds less to the error is not told from numbers that were re-tuned.
 TELLING_PART = 0.1
 LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
+# A patch may be followed less well than the description by this part before it is given up: chance does so much.
+ALLOWED_HARM = 0.01
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
 
@@ -140,7 +142,7 @@ class Prover:
             useless = self._useless(explanation, held_out)
             if useless is None:
                 after = self._rollout(explanation, held_out)
-                useless = self._misleading(explanation, held_out, after)
+                useless = self._misleading(explanation, held_out, after) or self._no_better(explanation, held_out)
             if useless is None:
                 break
             index, reason = useless
@@ -152,12 +154,9 @@ class Prover:
                 refused.add(held_out.instances[index])
             else:
                 explanation = self.reduce(explanation, kept)
-        predicted = held_out.problem.residual - held_out.problem.nominal_residual
+        predicted = _of_description(held_out.problem)
         if self._is_patched(explanation):
-            means = held_out.means()
-            bare = means.copy()
-            bare[:, : held_out.nuisances] = 0.0
-            predictions = [held_out.predicted(numbers) for numbers in (means, bare)]
+            predictions = _with_and_without_numbers(held_out)
             errors = [self._error(explanation, held_out, prediction) for prediction in predictions]
             self.tuned = errors[0] <= errors[1] and not self._simulates_worse(explanation, after)
             predicted = predictions[0 if self.tuned else 1]
@@ -278,6 +277,19 @@ class Prover:
                 harms.append((float(errors.worse()[0]), index))
         worst, index = max(harms, default=(0.0, 0))
         return (index, "the simulation follows less well with it") if worst > 0.0 else None
+
+    def _no_better(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
+        """The effect that helps least, where the description alone is followed better than with all of them.
+
+        Each may help beside the others and numbers far off that it makes up for; what is proposed has to do so by itself.
+        """
+        if not self._is_patched(explanation) or not held_out.proposed:
+            return None
+        best = min(self._error(explanation, held_out, prediction) for prediction in _with_and_without_numbers(held_out))
+        alone = self._error(explanation, held_out, _of_description(held_out.problem))
+        if best <= (1.0 + ALLOWED_HARM) ** 2 * alone:
+            return None
+        return min(held_out.proposed, key=lambda index: held_out.help_of(index)[0]), "the description alone does better"
 
     def _simulation_tells(self, explanation: Explanation, instance: Instance) -> bool:
         if instance in self.laws.laws:
@@ -456,6 +468,19 @@ def _floors(explanation: Explanation, problem: RegressionProblem) -> FloatArray:
     squares = np.where(problem.valid, problem.misjudged**2, 0.0).sum(axis=0) / np.maximum(problem.valid.sum(axis=0), 1)
     result: FloatArray = np.hypot(floors, np.sqrt(squares))
     return result
+
+
+def _of_description(problem: RegressionProblem) -> FloatArray:
+    """What is taken of the residual (T, C) where nothing is patched."""
+    return problem.residual - problem.nominal_residual
+
+
+def _with_and_without_numbers(held_out: HeldOut) -> list[FloatArray]:
+    """What the fits take of the residual (T, C), with the numbers re-tuned beside the effects, and with those of the file."""
+    means = held_out.means()
+    bare = means.copy()
+    bare[:, : held_out.nuisances] = 0.0
+    return [held_out.predicted(numbers) for numbers in (means, bare)]
 
 
 def _shares(explanation: Explanation, problem: RegressionProblem) -> FloatArray:
