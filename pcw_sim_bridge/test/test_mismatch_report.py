@@ -217,6 +217,23 @@ def minimal_findings(verdict: str = "no_mismatch", **changes: Any) -> Findings:
     return dataclasses.replace(nothing, **changes)
 
 
+@pytest.mark.parametrize(
+    ("other", "target", "said"),
+    [
+        ("payload_mass", "chassis", "a part of payload_mass"),
+        ("payload_mass", "rear_left", "a part of payload_mass"),
+        ("payload_mass", "front_right", "payload_mass"),
+        ("ground_slope", "chassis", "payload_mass"),
+    ],
+)
+def test_a_doubted_effect_may_be_a_part_of_one_that_is_felt_there(other: str, target: str, said: str) -> None:
+    """A lag of one drive was said to be perhaps a part of a dead time of another."""
+    doubted = EffectFinding("x", ("rear_left",), 0.5, {}, "It is x.", ("payload_mass",), None)
+    beside = EffectFinding(other, (target,), 1.0, {}, "And more.", (), None)
+    summary = "\n".join(minimal_findings("explained", effects=(doubted, beside)).summary())
+    assert f"It is x. (It may as well be {said}.)" in summary
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a report of `demo_findings`; not to be changed."""

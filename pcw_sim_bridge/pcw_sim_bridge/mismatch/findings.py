@@ -391,7 +391,9 @@ class Findings:
 
     def _doubt(self, effect: EffectFinding) -> str:
         """What else a named effect may be, as words after its statement."""
-        named = {other.name for other in self.effects if other is not effect}
+        # A payload is felt by all wheels, but what is wrong with one drive is no part of what is wrong with another.
+        beside = [other for other in self.effects if other is not effect]
+        named = {o.name for o in beside if "chassis" in (*o.target, *effect.target) or {*o.target} & {*effect.target}}
         rivals = [f"a part of {name}" if name in named else name for name in effect.ambiguous_with]
         return f" (It may as well be {' or '.join(rivals)}.)" if rivals else ""
 

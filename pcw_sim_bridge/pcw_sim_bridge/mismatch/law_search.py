@@ -339,7 +339,6 @@ class _Screened:
                 plain += own.T @ (self._pairs[key, other][:, None] * others)
         return plain, cross, moment
 
-
     def products_of(self, columns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the same of whole columns (S, C, F)."""
         own = (columns * self._weight[:, :, None]).reshape(-1, columns.shape[2])
