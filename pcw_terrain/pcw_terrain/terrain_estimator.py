@@ -12,7 +12,7 @@ Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (s
   The curve's mean is bent as well by slip that moves within the filter's memory, which is put back; what noise alone makes
   it move is less than two blocks' noise, since filter and tyre carry noise from one to the next;
 - the equations are solved with an instrument, the mean of the slip two blocks before and after, whose noise is another one
-  (further off where the tyre's relaxation carries noise along):
+  (further off, once there are many blocks, where the tyre's relaxation carries noise along):
 
       sum w z (mu_k - mu_p g_c(x_k)) = 0,    sum w a (mu_k - mu_p g_c(x_k)) = 0,    z = g(x_i),  a = -x_i g'(x_i),
 
@@ -58,7 +58,8 @@ BLOCK_SPREAD = 2.0 / BLOCK_TIME_CONSTANTS**2 + 1.0 / 12.0
 SPECTRUM_POINTS = 32
 # Noise of a block is followed into so many blocks after it: tyres at 0.3 m/s carry a tenth of it as far.
 PAIRS = 8
-# The instrument is so many blocks older, and by the tyre's relaxation more.
+# The instrument is so many blocks older and younger, and by the tyre's relaxation more: once there are many blocks, as further
+# off it follows the slip less. Of a few blocks their noise is worth more than what the tyre has carried and is not taken off.
 LEAST_LAG, RELAXATION_LAG = 2, 1.0
 # Noise below this part of the slip is none.
 QUIET_NOISE = 0.05
@@ -342,12 +343,12 @@ def _grid(j):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_block(table, numbers, state, sums, now, lag, lag_signs, averaged, spread):  # type: ignore[no-untyped-def]
+def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged, spread):  # type: ignore[no-untyped-def]
     """Add one block of the history to the sums of every lambda_p.
 
-    `lag` is the instrument's slip, the mean of two blocks, each along its own force; `lag_signs` is 1 if both forces point the
-    way that this block's does, 0 if one does, -1 if none. `averaged` is the slip around the block, `spread` the deviation of
-    that.
+    `lag` is the instrument's slip, the mean of two blocks that lie `apart` blocks from this one, each along its own force;
+    `lag_signs` is 1 if both forces point the way that this block's does, 0 if one does, -1 if none. `averaged` is the slip
+    around the block, `spread` the deviation of that.
     """
     slip, slip_variance, friction, friction_variance, bending = now[0], now[1], now[2], now[3], now[6]
     pole = POLE_PER_CUT_OFF * numbers[_CUT_OFF]
@@ -360,7 +361,7 @@ def _add_block(table, numbers, state, sums, now, lag, lag_signs, averaged, sprea
     of_slip *= now[10]
     for m in range(3):
         of_friction[m] = now[12] * ends_share(m) + now[13] * of_force[m]
-    shared = lag_signs * of_slip[min(max(int(now[7]), LEAST_LAG), PAIRS - 1)]
+    shared = lag_signs * of_slip[min(apart, PAIRS - 1)]
     best = state[_RESULT + 1]
     informative = 1.0
     if best > 0.0:
@@ -546,7 +547,7 @@ def _forget(state, sums):  # type: ignore[no-untyped-def]
 def _take(table, numbers, state, sums, history, last, begin):  # type: ignore[no-untyped-def]
     """Add the blocks whose instrument is complete with block `last` of the history, not looking at blocks before `begin`."""
     for index in range(begin, last - LEAST_LAG + 1):
-        lag = max(int(history[index, 7]), LEAST_LAG)
+        lag = LEAST_LAG if state[_BLOCKS] < YOUNG_BLOCKS else max(int(history[index, 7]), LEAST_LAG)
         if history[index, 5] < 1.0 or history[index, 8] > 0.0 or index + lag > last or index - lag < begin:
             continue
         whole = True
@@ -564,7 +565,7 @@ def _take(table, numbers, state, sums, history, last, begin):  # type: ignore[no
         spread = 1.5 * math.sqrt(spread) / (2 * LEAST_LAG + 1)
         instrument = 0.5 * (history[index - lag, 0] + history[index + lag, 0])
         signs = 0.5 * now[14] * (history[index - lag, 14] + history[index + lag, 14])
-        _add_block(table, numbers, state, sums, now, instrument, signs, averaged, spread)
+        _add_block(table, numbers, state, sums, now, instrument, lag, signs, averaged, spread)
 
 
 @compiled

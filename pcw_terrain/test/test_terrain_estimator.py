@@ -164,9 +164,17 @@ def test_a_critical_slip_as_small_as_the_noise_of_the_slip_is_none_that_was_seen
 
 
 def test_changes_of_ground_are_found_and_settled():
-    found = terrain_study.change_times(range(6))
-    assert np.quantile(found.detected, 0.9) <= 0.3 and np.isfinite(found.detected).all()
-    assert np.median(found.settled) <= 0.8 and np.quantile(found.settled, 0.8) <= 1.0
+    found = terrain_study.change_times(range(50))
+    assert found.detected.max() <= 0.3
+    assert np.mean(found.settled <= 0.8) >= 0.97
+
+
+@pytest.mark.parametrize("seed", [51052, 51097, 51163])
+def test_a_new_ground_is_known_soon_under_slip_that_swings_fast(seed):
+    """An instrument that lies as far off as the tyre carries noise follows nothing of a slip that swings at 2.9 Hz: the first
+    second on a new ground said next to nothing, and the estimate settled after 0.8 to 1.5 s.
+    """
+    assert terrain_study.change_times(range(seed, seed + 1)).settled.max() <= 0.8
 
 
 def test_a_suspicion_that_chance_began_carries_nothing_into_the_new_estimate():
