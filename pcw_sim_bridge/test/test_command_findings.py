@@ -40,6 +40,18 @@ def test_what_all_steerings_have_alike_is_one_effect_with_its_name(effect, param
     assert other not in named.ambiguous_with
 
 
+@pytest.mark.parametrize("delay", [0.0022, 0.0033, 0.0062])
+def test_a_dead_time_that_reaches_a_little_into_a_cycle_is_one_and_as_long_as_it_is(delay):
+    """One of 2.1 ms changes a tenth of a torque at 300 Hz, and only where a command was held over 3 ms. No time on the grid
+    had less than twice of that: two drives were given a lag, another was silent as it lies near what noise hides.
+    """
+    [(named, instance)] = found(EffectInstance("actuator_delay", ROBOT.caster_names, {"delay": delay}, "drive")).named
+    assert (instance.name, instance.target, instance.axis) == ("actuator_delay", ROBOT.caster_names, "drive")
+    estimate = named.estimates["delay"]
+    assert estimate.value == pytest.approx(delay, rel=0.02)
+    assert 0.0 < estimate.high - estimate.low < 0.05 * delay
+
+
 @pytest.mark.parametrize(("part_of_a_delay", "doubted"), [(90.0, True), (-2.0, True), (-20.0, False)])
 def test_what_a_part_of_another_effect_explains_as_well_is_named_with_it(part_of_a_delay, doubted):
     """A dead time of 2.1 ms at 300 Hz shows in a part of the samples; two of four drives were given a lag, p = 1."""

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.robot_description import AXIS_NAMES
 
 from .evidence_selection import EffectSearch
 from .explanation import AMBIGUOUS, HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
@@ -24,6 +25,8 @@ from .selection_settings import SelectionSettings
 from .whitened_regression import Instance
 
 Progress = Callable[[str], None]
+# A part of the noise that what most joints of an axis have must move another at least.
+SHARE_OF_COMMON = 0.1
 # Numbers of several joints agree where chance alone would part them further once in so many.
 AGREEING = 0.999
 
@@ -63,10 +66,9 @@ def command_findings(
     """
     others = {problem.channels[0].name: problem for problem in held_out}
     found = CommandFindings()
-    for problem in problems:
+    for problem, explanation in zip(problems, _explanations(problems, seed, settings), strict=True):
         rng = np.random.default_rng(seed)
         channel = problem.channels[0]
-        explanation = None if _is_idle(problem, settings) else with_rivals(explain(problem, rng, settings))
         added, floor = np.zeros_like(problem.residual), _size(problem.residual)
         flagged = False
         if explanation is not None:
@@ -91,6 +93,33 @@ def command_findings(
             (*found.ladder, *_ladder(explanation)),
         )
     return _shared(found, [problem.channels[0] for problem in problems])
+
+
+def _explanations(
+    problems: Sequence[RegressionProblem], seed: int, settings: SelectionSettings | None
+) -> list[Explanation | None]:
+    """What each joint says; None where it says nothing.
+
+    All joints of an axis hang on one bus and on drives of one kind. What most of them have is looked for in the others down to
+    a smaller part of the noise than where nothing is known.
+    """
+    def said(problem: RegressionProblem, own: SelectionSettings | None) -> Explanation | None:
+        return None if _is_idle(problem, own) else with_rivals(explain(problem, np.random.default_rng(seed), own))
+
+    found = [said(problem, settings) for problem in problems]
+    small = dataclasses.replace(settings or SelectionSettings(), smallest_share=SHARE_OF_COMMON)
+    for axis in AXIS_NAMES:
+        alike = [k for k, problem in enumerate(problems) if problem.channels[0].axis == axis]
+        effects = {k: {named.term.effect for named in explanation.named} for k in alike if (explanation := found[k])}
+        for effect in sorted(set().union(*effects.values())):
+            without = [k for k in alike if effect not in effects.get(k, ())]
+            if 2 * len(without) >= len(alike):
+                continue
+            for k in without:
+                again = said(problems[k], small)
+                if again is not None and {named.term.effect for named in again.named} == {effect, *effects.get(k, ())}:
+                    found[k] = again
+    return found
 
 
 def with_rivals(explanation: Explanation) -> Explanation:

@@ -27,6 +27,7 @@ from .regression_problem import (
     BoolArray,
     Channel,
     FloatArray,
+    IntArray,
     LinearParameter,
     Nuisance,
     RegressionProblem,
@@ -41,6 +42,9 @@ LATENCY_PART = 0.1
 PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
+# A dead time shows once it reaches into the last step of a cycle, and first in proportion to how far: by these parts of a step.
+REACHES = (0.03, 0.08, 0.2, 0.5)
+CYCLES = 2  # so many different lengths of cycles are looked at: 3 and 4 ms at 300 Hz among steps of 1 ms
 # Torques at which a drive may give no more, by how much of the time more was asked of it.
 LARGEST_QUANTILES = (0.8, 0.95, 0.99, 0.999)
 QUANTILES = (0.3, 0.5, 0.65, 0.8, 0.88, 0.94, 0.97, 0.985)
@@ -82,14 +86,21 @@ def _torque_along(kernel, values, memory, command, rate, step, steps):  # type: 
 
 def through(effect: ActuatorEffect, values: Mapping[str, float], joint: CommandedJoint, command: FloatArray) -> FloatArray:
     """Return the torque (T,) [N m] that an actuator with the effect makes of a command (T,)."""
-    step = joint.interval / max(1, int(np.ceil(joint.interval / LARGEST_STEP - 1e-6)))
-    # A rate that is no whole part of the controller's: intervals of 3, 3 and 4 ms, over which a command was held so long.
-    intervals = np.diff(joint.time, prepend=joint.time[0] - joint.interval)
-    steps = np.maximum(np.rint(intervals / step), 1).astype(np.int64)
+    step, steps = _steps(joint)
     torque: FloatArray = _torque_along(
         effect.drive, effect.values(values), MEMORY + effect.memory(values, step), command, joint.rate, step, steps
     )
     return torque
+
+
+def _steps(joint: CommandedJoint) -> tuple[float, IntArray]:
+    """Step [s] of the kernels, and how many of them a command was held before each sample (T,).
+
+    At a rate that is no whole part of the controller's these are not the same everywhere: intervals of 3, 3 and 4 ms.
+    """
+    step = joint.interval / max(1, int(np.ceil(joint.interval / LARGEST_STEP - 1e-6)))
+    intervals = np.diff(joint.time, prepend=joint.time[0] - joint.interval)
+    return step, np.maximum(np.rint(intervals / step), 1).astype(np.int64)
 
 
 def commanded_joints(
@@ -218,7 +229,8 @@ class _JointProblem:
             return (), {}
         [first] = needed
         if first.unit == "s":
-            return tuple({**defaults, first.name: float(t)} for t in TIMES), {first.name: ("log", TIME_SPACING)}
+            times = sorted((*TIMES, *self._reaching()))
+            return tuple({**defaults, first.name: float(t)} for t in times), {first.name: ("log", TIME_SPACING)}
         if first.unit != "N m":
             return (), {}
         command = np.abs(self._plain)
@@ -235,6 +247,13 @@ class _JointProblem:
                 for part in KNEES for gap in (0.3, 0.8, 2.0) if top > 0.0
             ]
         return tuple(shapes), resolution
+
+    def _reaching(self) -> list[float]:
+        """Times [s] that reach a little into the last step of the commonest cycles."""
+        step, steps = _steps(max(self.pieces, key=lambda piece: len(piece.time)))
+        lengths, counts = np.unique(steps, return_counts=True)
+        common = lengths[np.argsort(-counts, kind="stable")[:CYCLES]]
+        return [float(step * (length - 1 + part)) for length in common for part in REACHES]
 
     def _variables(self) -> dict[str, FloatArray]:
         return {

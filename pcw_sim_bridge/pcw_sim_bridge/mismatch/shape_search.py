@@ -93,6 +93,7 @@ class _Place:
         self._trials, self._instance = trials, instance
         self._name, self._kind = name, kind
         self._known: dict[float, float] = {}
+        self.whole = trials.whole
         # A size that cannot be is no better an explanation for its larger evidence, unless no other is known.
         self._bounded = bounded and trials.evidence([instance])[0][1]
 
@@ -127,12 +128,20 @@ class _Place:
 def _largest(place: _Place, width: float, coarse: bool) -> float:
     """Step of largest evidence within a width to either side, or near the last one where the search is not coarse."""
     steps = np.linspace(-1.0, 1.0, COARSE) * width
-    spacing, best = float(steps[1] - steps[0]), 0.0
-    if coarse:
-        grid = [float(step) for step in np.round(steps / spacing) * spacing]
-        place.look_at(grid)
-        best = max(grid, key=place.evidence)
-    spacing *= 1.0 if coarse else 0.5
+    spacing = float(steps[1] - steps[0])
+    if not coarse:
+        return _climbed(place, 0.0, 0.5 * spacing, width)
+    grid = [float(step) for step in np.round(steps / spacing) * spacing]
+    place.look_at(grid)
+    peaks = [max(grid, key=place.evidence)]
+    if place.whole:  # there is a peak between any two steps of a cycle, each narrower than what lies between two of the grid
+        known = [-math.inf, *(place.evidence(step) for step in grid), -math.inf]
+        peaks += [step for k, step in enumerate(grid) if known[k] < known[k + 1] > known[k + 2]]
+    return max((_climbed(place, peak, spacing, width) for peak in dict.fromkeys(peaks)), key=place.evidence)
+
+
+def _climbed(place: _Place, best: float, spacing: float, width: float) -> float:
+    """Step of the peak next to one, by parabolas through points so far from each other at first."""
     for _ in range(PARABOLAS):
         place.look_at([best - spacing, best, best + spacing])
         left, middle, right = place.evidence(best - spacing), place.evidence(best), place.evidence(best + spacing)

@@ -27,6 +27,8 @@ class ShapeTrials:
         term = regression.problem.terms[instance.term]
         parameters = [term.parameters[k] for k in instance.active]
         self._deviations = np.array([[p.deviation for p in parameters]])
+        # What is there or not there is as a whole where its shape is the right one, whatever part of another would do.
+        self.whole = len(parameters) == 1 and parameters[0].hidden
         self._lower, self._upper = np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
         self._without = regression.fit(others).log_evidence + term.log_prior
 
@@ -37,6 +39,13 @@ class ShapeTrials:
         cross = linalg.solve_triangular(self._factor, self._design.T @ columns, lower=True)
         moment = columns.T @ self.regression.target[:, None]
         own = np.stack([piece.T @ piece for piece in pieces])
+        if self.whole:
+            size = own[:, 0, 0] - np.sum(cross**2, axis=0)
+            product = moment[:, 0] - (cross.T @ self._projected)[:, 0]
+            return [
+                (self._without + float(gain) - instance.occam, True)
+                for instance, gain in zip(instances, product - 0.5 * size, strict=True)
+            ]
         gains, means = marginal_gains(own, cross, moment, self._projected, self._deviations)
         allowed = np.all((means[:, :, 0] >= self._lower) & (means[:, :, 0] <= self._upper), axis=1)
         return [
