@@ -12,17 +12,20 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.robot_description import thinnest_module_inertia
+from pcw_sim_bridge.mismatch import law_models, proof
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.all_cores import on_all_cores
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.explanation import NamedTerm, explain
+from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm, explain
 from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
+from pcw_sim_bridge.mismatch.generated_effect import NoSuchKernelError
 from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
+from pcw_sim_bridge.mismatch.open_set import Leftover
 from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
 from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot
-from pcw_sim_bridge.mismatch.regression_problem import Channel, RegressionProblem, Term
+from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Channel, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
 from pcw_sim_bridge.mismatch.rollout import HORIZONS, Windows
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -330,6 +333,41 @@ def test_effects_that_only_make_up_for_numbers_far_off_are_no_patch(size: float,
     found = Prover._no_better(prover, SimpleNamespace(), held_out)  # type: ignore[arg-type]
     assert (found is None) == stays
     assert found is None or found[0] == 0
+
+
+@pytest.mark.parametrize(("contradicted", "stays"), [("errors", False), ("simulation", True), ("", True)])
+def test_a_law_that_other_data_contradict_is_no_finding(monkeypatch, contradicted: str, stays: bool) -> None:
+    """A healthy robot's small leftover, and two beside effects found rightly, were laws that held-out data had refused."""
+    monkeypatch.setattr(law_models, "generate", no_kernel)
+    law = SimpleNamespace(sites=("drive_torque/left",), depends_on=("speed",))
+    term = SimpleNamespace(effect=UNKNOWN, target=law.sites, arguments=law.depends_on)
+    label = "unknown/drive_torque/left by speed"
+    search = SimpleNamespace(problem=SimpleNamespace(terms=(term,)), label=lambda instance: label)
+    selection = SimpleNamespace(fit=SimpleNamespace(instances=(Instance(0, (), (0,)),)))
+    left = Leftover("chassis_force/x", "speed", 0.1, 40.0, (np.zeros(2), np.zeros(2)), ("speed",), law=law)
+    explanation = Explanation(search, selection, (), (left,), (), None, (), np.ones(1), np.ones(1))  # type: ignore[arg-type]
+    against = SimpleNamespace(
+        instances=selection.fit.instances, help_of=lambda index: (-40.0, 50.0), problem=SimpleNamespace(nominal_residual=0.0)
+    )
+
+    def says(prover, what):
+        return (0, "worse") if prover.laws.laws and contradicted == what else None
+
+    prover = SimpleNamespace(
+        _held_out=lambda explanation: against, _rollout=lambda explanation, held_out: None,
+        _useless=lambda explanation, held_out: says(prover, "errors"),
+        _misleading=lambda explanation, held_out, after: says(prover, "simulation"),
+        _no_better=lambda explanation, held_out: None, _is_patched=lambda explanation: False,
+        _remarks=lambda *rest: [], _finding=lambda *rest: None, tuned=True,
+    )
+    monkeypatch.setattr(proof, "_of_description", lambda problem: np.zeros(1))
+    result = Prover.prove(prover, explanation)  # type: ignore[arg-type]
+    assert bool(result.explanation.leftovers) == stays
+    assert bool(result.dropped) == bool(contradicted) == (result.laws == ())
+
+
+def no_kernel(*rest: object) -> None:
+    raise NoSuchKernelError("none of an effect")
 
 
 @pytest.mark.parametrize(("effect", "moves"), [("imu_lever_arm", False), ("clock_offset", False), ("payload_mass", True)])

@@ -17,6 +17,7 @@ import yaml
 from pcw_sim_bridge.mismatch import report, report_figures
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.findings import (
+    REFUSED,
     VERDICTS,
     ChannelFinding,
     ChannelProof,
@@ -470,6 +471,14 @@ def test_every_verdict_renders(tmp_path: Path, verdict: str) -> None:
     assert (findings.nothing_missing()[1:] if verdict == "no_mismatch" else report.HEADLINES[verdict]) in page
     assert 'id="effects"' not in page
     assert "nothing was held out" in page
+
+
+def test_what_held_out_data_refuse_is_in_the_verdict() -> None:
+    """7000 nats for a play, which another recording contradicted: "nothing is missing", and no word of it but in the notes."""
+    refused = LadderFinding("drop gear_backlash/drive of left", -167.0, -167.0, f"{REFUSED}: the error is no smaller with it")
+    verdict = dataclasses.replace(minimal_findings("no_mismatch"), ladder=(refused,)).nothing_missing()
+    assert verdict.startswith("no effect is missing") and "gear_backlash/drive of left" in verdict
+    assert "nothing is missing" not in verdict
 
 
 def test_numbers_that_no_healthy_robot_has_are_in_the_verdict(tmp_path: Path) -> None:

@@ -99,6 +99,8 @@ LONGEST_MISFIT = 50.0
 STAYS_VALID = 1.25
 # Spreads of the logarithms of mu_p and lambda_p up to which a reading can be compared with an estimate, valid or not.
 COMPARABLE = (0.2, 0.5)
+# So many blocks must have slipped beyond `least_slip`: fewer of gentle slip may be noise.
+BEYOND_BLOCKS = 5.0
 # A curve must fit better than a straight line by so much (twice the logarithm of the likelihood).
 BENT = 20.0
 
@@ -520,7 +522,7 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
     where = math.ceil(math.log(upper / LEAST_CRITICAL_SLIP) / step)
     if state[_WRONG_SIGN] >= WRONG_SIGN_BLOCKS:
         result[7] = WRONG_SIGN
-    elif where >= GRID or sums[where, _BEYOND] < 3.0 or straight - least < BENT * scale:
+    elif where >= GRID or sums[where, _BEYOND] < BEYOND_BLOCKS or straight - least < BENT * scale:
         result[7] = TOO_LITTLE_SLIP
     elif state[_SLIP_NOISE] > GREATEST_NOISE * critical:
         result[7] = TOO_LITTLE_SLIP

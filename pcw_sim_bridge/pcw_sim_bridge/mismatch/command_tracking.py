@@ -42,7 +42,7 @@ LATENCY_PART = 0.1
 PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
-# A dead time shows once it reaches into the last step of a cycle, and first in proportion to how far: by these parts of a step.
+# A dead time shows once it reaches into the last step of a cycle, at first in proportion to how far: by these parts of a step.
 REACHES = (0.03, 0.08, 0.2, 0.5)
 CYCLES = 2  # so many different lengths of cycles are looked at: 3 and 4 ms at 300 Hz among steps of 1 ms
 # Torques at which a drive may give no more, by how much of the time more was asked of it.

@@ -14,6 +14,7 @@ Interval = tuple[float, float]
 
 FORMAT = "pcw_mismatch/1"
 VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
+REFUSED = "fitted but did not help held out"  # an outcome of the ladder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -384,7 +385,13 @@ class Findings:
         where = ""
         if not any("force" in channel.name for channel in self.channels):
             where = f" in {', '.join(channel.name for channel in self.channels)} (forces could not be judged)"
+        labels = [step.description.removeprefix("drop ") for step in self.ladder if step.outcome.startswith(REFUSED)]
+        refused = [f"a dependence on {label.partition(' by ')[2]}" if " by " in label else label for label in labels]
+        if refused:  # nothing proved, which is not the same as nothing there
+            where += f" that held-out data bear out; the fitted recordings alone speak for {', '.join(refused)}"
         strained = [f"{number.name} ({number.times:.1f} tolerances)" for number in self.retuned if number.strained]
+        if refused and not strained:
+            return f"no effect is missing{where}"
         if not strained:
             return f"nothing is missing{where}: what differs is within noise and tolerances"
         return f"no effect is missing{where}, but the description is off by more than its tolerances in {', '.join(strained)}"

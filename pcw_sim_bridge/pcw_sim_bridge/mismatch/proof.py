@@ -19,7 +19,7 @@ from pcw_description.effects.registry import also_known, get
 
 from .errors import MismatchError
 from .explanation import AMBIGUOUS, Explanation
-from .findings import ChannelProof, FitFinding, LadderFinding, RolloutProof
+from .findings import REFUSED, ChannelProof, FitFinding, LadderFinding, RolloutProof
 from .found_effect import effect_instance
 from .held_out import HeldOut
 from .law_models import LawModels
@@ -135,23 +135,27 @@ class Prover:
         dropped: list[LadderFinding] = []
         notes: list[str] = []
         refused: set[Instance] = set()
+        contradicted: list[Law] = []
         while True:
             self.laws = LawModels(explanation, refused)
             held_out = self._held_out(explanation)
             after = None
-            useless = self._useless(explanation, held_out)
+            useless, simulated = self._useless(explanation, held_out), None
             if useless is None:
                 after = self._rollout(explanation, held_out)
-                useless = self._misleading(explanation, held_out, after) or self._no_better(explanation, held_out)
+                simulated = self._misleading(explanation, held_out, after)
+                useless = simulated or self._no_better(explanation, held_out)
             if useless is None:
                 break
             index, reason = useless
             label, nats = explanation.search.label(held_out.instances[index]), held_out.help_of(index)[0]
-            dropped.append(LadderFinding(f"drop {label}", nats, nats, f"fitted but did not help held out: {reason}"))
-            notes.append(f"{label} was fitted but did not help held out: {reason}. It is not proposed.")
+            dropped.append(LadderFinding(f"drop {label}", nats, nats, f"{REFUSED}: {reason}"))
+            notes.append(f"{label} was {REFUSED}: {reason}. It is not proposed.")
             kept = [i for i in explanation.selection.fit.instances if i != held_out.instances[index]]
             if held_out.instances[index] in self.laws.laws:  # what was fitted has it all the same
                 refused.add(held_out.instances[index])
+                if simulated is None:
+                    contradicted.append(self.laws.laws[held_out.instances[index]])
             else:
                 explanation = self.reduce(explanation, kept)
         predicted = _of_description(held_out.problem)
@@ -165,6 +169,10 @@ class Prover:
                 notes.append(
                     "The description's numbers as re-tuned beside the effects do not help held out: in the patch they stay."
                 )
+        # What forces and slips of other data contradict is no finding. A simulation that goes astray says less: something may
+        # be left out, and its law not the right one.
+        left = tuple(found for found in explanation.leftovers if not any(found.law is law for law in contradicted))
+        explanation = dataclasses.replace(explanation, leftovers=left)
         notes += self._remarks(explanation, held_out, after)
         finding = self._finding(explanation, held_out, predicted, after)
         laws = tuple(self.laws.laws.values())

@@ -153,7 +153,7 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
     torque = shaft[:, axis] - rotor * (motion.acceleration[:, i] @ coupling[axis])
     ahead = _lagging(torque / gear.stiffness, gear.damping / gear.stiffness * motion.rate)
     if gear.play > 0.0:
-        ahead = ahead + 0.5 * gear.play * _flank(torque)
+        ahead = ahead + 0.5 * gear.play * _flank(torque, motion.velocity[:, i] @ coupling[axis])
     smooth = SignalFilter(motion.rate, motion.cutoff).smooth(ahead)
     moved: FloatArray = smooth[:, None] * np.linalg.inv(coupling)[:, axis]
     return moved
@@ -167,14 +167,23 @@ def _lagging(values: FloatArray, lag: float) -> FloatArray:
     return followed
 
 
-def _flank(torque: FloatArray) -> FloatArray:
-    """Which flank of its play a gear lies on under a torque (T,): 1, -1, and 0 before the first clear torque.
+def _flank(torque: FloatArray, rate: FloatArray) -> FloatArray:
+    """Which flank of its play a gear lies on under a torque (T,): 1, -1, between them, and 0 before the first clear torque.
 
-    Where next to no torque passes through it nothing moves motor and joint against each other: it stays where it lay.
+    Where next to no torque passes through it the motor is free. If it then comes to lie on the other flank, it has left the
+    one with the joint's speed and gone ahead ever faster: with the square of the way (T,) of its rate [rad/s], so that nothing
+    is crossed at rest. If it comes to lie on the same flank again, it has not left it.
     """
+    count = len(torque)
     clear = np.abs(torque) > PLAY_TORQUE * float(np.sqrt(np.mean(torque**2)))
-    last = np.maximum.accumulate(np.where(clear, np.arange(len(torque)), -1))
-    flank: FloatArray = np.where(last >= 0, np.sign(torque[last]), 0.0)
+    index = np.arange(count)
+    last = np.maximum.accumulate(np.where(clear, index, -1))
+    following = np.minimum.accumulate(np.where(clear, index, count)[::-1])[::-1]
+    following = np.where(following < count, following, last)
+    way = np.cumsum(np.abs(rate))
+    crossed = (way - way[last]) / np.maximum(way[following] - way[last], 1e-300)
+    left, reached = np.sign(torque[last]), np.sign(torque[following])
+    flank: FloatArray = np.where(last >= 0, left + (reached - left) * np.clip(crossed, 0.0, 1.0) ** 2, 0.0)
     return flank
 
 
