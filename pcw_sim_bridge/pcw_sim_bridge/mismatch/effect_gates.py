@@ -145,11 +145,15 @@ class EffectGates:
         seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * remains, part), 1e-300)))
         if share >= 1.0 or seen < 1.0 or self.problem.drifts is None:
             return share
+        return max(share, min(seen, regression.peculiar(change) / self._peculiarity(instances)))
+
+    def _peculiarity(self, instances: Sequence[Instance]) -> float:
+        """Nats beside the model's own errors from which a contribution is none of them."""
         if all(self._at_joints(instance) for instance in instances):
-            wanted = self.settings.least_peculiar_torque
-        else:
-            wanted = self.settings.least_peculiar * self._noise_factor(instances)
-        return max(share, min(seen, regression.peculiar(change) / wanted))
+            return self.settings.least_peculiar_torque
+        unlike = all(self._at_joints(i) or self.problem.terms[i.term].unlike_errors for i in instances)
+        least = self.settings.least_peculiar_torque if unlike else self.settings.least_peculiar
+        return least * self._noise_factor(instances)
 
     def _at_joints(self, instance: Instance) -> bool:
         """Whether an effect of the library adds torques to joints, in proportion to its numbers."""

@@ -155,6 +155,8 @@ class Term:
         is_exact: the problem's exact residual holds it; is_curved: and it is not in proportion to its parameters.
         turning: a phase or a direction shapes it, of which two a quarter turn apart make all others.
         noisy: its columns hold some of the noise that the residual holds, by the control that acts on that noise.
+        unlike_errors: it turns with the angle of its own joint, or changes sides with the torque of its gear, as nothing does
+            that the model misjudges.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
         recording: the only one in which it is at work; None: it is in all, at the same time.
     """
@@ -176,6 +178,7 @@ class Term:
     is_curved: bool = False
     turning: bool = False
     noisy: bool = False
+    unlike_errors: bool = False
     once: bool = False
     recording: int | None = None
 

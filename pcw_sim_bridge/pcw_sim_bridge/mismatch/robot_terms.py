@@ -227,6 +227,7 @@ class _TermMaker:
             turning=turning is not None,
             # Where no torque was measured, tyres slip under the forces that the motion asks for, and its noise is in these.
             noisy=isinstance(effect, TransmissionEffect) or (effect.name.startswith("tyre_") and not self.layout.balanced),
+            unlike_errors="play" in names or (isinstance(effect, EncoderEffect) and turning is not None),
             once=look in ("windows", "patches"),
             recording=recording,
         )
