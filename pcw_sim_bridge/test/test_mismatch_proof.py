@@ -335,8 +335,13 @@ def test_effects_that_only_make_up_for_numbers_far_off_are_no_patch(size: float,
     assert found is None or found[0] == 0
 
 
-@pytest.mark.parametrize(("contradicted", "stays"), [("errors", False), ("simulation", True), ("", True)])
-def test_a_law_that_other_data_contradict_is_no_finding(monkeypatch, contradicted: str, stays: bool) -> None:
+@pytest.mark.parametrize(
+    ("contradicted", "share", "stays"),
+    [("errors", 0.1, False), ("errors", 0.8, True), ("simulation", 0.1, True), ("", 0.1, True)],
+)
+def test_a_small_law_that_other_data_contradict_is_no_finding(
+    monkeypatch, contradicted: str, share: float, stays: bool
+) -> None:
     """A healthy robot's small leftover, and two beside effects found rightly, were laws that held-out data had refused."""
     monkeypatch.setattr(law_models, "generate", no_kernel)
     law = SimpleNamespace(sites=("drive_torque/left",), depends_on=("speed",))
@@ -344,7 +349,7 @@ def test_a_law_that_other_data_contradict_is_no_finding(monkeypatch, contradicte
     label = "unknown/drive_torque/left by speed"
     search = SimpleNamespace(problem=SimpleNamespace(terms=(term,)), label=lambda instance: label)
     selection = SimpleNamespace(fit=SimpleNamespace(instances=(Instance(0, (), (0,)),)))
-    left = Leftover("chassis_force/x", "speed", 0.1, 40.0, (np.zeros(2), np.zeros(2)), ("speed",), law=law)
+    left = Leftover("chassis_force/x", "speed", share, 40.0, (np.zeros(2), np.zeros(2)), ("speed",), law=law)
     explanation = Explanation(search, selection, (), (left,), (), None, (), np.ones(1), np.ones(1))  # type: ignore[arg-type]
     against = SimpleNamespace(
         instances=selection.fit.instances, help_of=lambda index: (-40.0, 50.0), problem=SimpleNamespace(nominal_residual=0.0)

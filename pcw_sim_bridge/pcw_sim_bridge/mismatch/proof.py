@@ -39,6 +39,8 @@ TELLING_PART = 0.1
 LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 # A patch may be followed less well than the description by this part before it is given up: chance does so much.
 ALLOWED_HARM = 0.01
+# Part of what no name explained from which a law is told of though other data contradict it.
+MOST_OF_IT = 0.5
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
 
@@ -169,9 +171,12 @@ class Prover:
                 notes.append(
                     "The description's numbers as re-tuned beside the effects do not help held out: in the patch they stay."
                 )
-        # What forces and slips of other data contradict is no finding. A simulation that goes astray says less: something may
-        # be left out, and its law not the right one.
-        left = tuple(found for found in explanation.leftovers if not any(found.law is law for law in contradicted))
+        # A small part of what was left, which forces and slips of other data contradict, is a detail of what was fitted; most
+        # of it was there. A simulation that goes astray says less: the law may be the wrong one for something that is there.
+        left = tuple(
+            found for found in explanation.leftovers
+            if found.share >= MOST_OF_IT or not any(found.law is law for law in contradicted)
+        )
         explanation = dataclasses.replace(explanation, leftovers=left)
         notes += self._remarks(explanation, held_out, after)
         finding = self._finding(explanation, held_out, predicted, after)
