@@ -176,9 +176,11 @@ class RosTest:
     def call(self, service_type: Any, name: str, request: Any = None) -> Any:
         """Call a service and return its response."""
         client = self._clients.get(name)
+        is_new = client is None
         if client is None:
             client = self._clients[name] = self.peer.create_client(service_type, name)
-        if not client.service_is_ready():
+        # To a new client a service that the peer knew before is ready at once, and knows nothing of it.
+        if is_new or not client.service_is_ready():
             self.wait_for(client.service_is_ready)
             self.spin_for(FOUND_BY_SERVER)
         future = client.call_async(request if request is not None else service_type.Request())
