@@ -173,8 +173,8 @@ class RosTest:
         end = time.monotonic() + duration
         self.wait_for(lambda: time.monotonic() > end, duration + DEADLINE, while_doing, every)
 
-    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
-        """Call a service and return its response."""
+    def client(self, service_type: Any, name: str) -> Any:
+        """Return the client of a service, once both know each other; for calls during which nothing may wait."""
         client = self._clients.get(name)
         is_new = client is None
         if client is None:
@@ -183,6 +183,11 @@ class RosTest:
         if is_new or not client.service_is_ready():
             self.wait_for(client.service_is_ready)
             self.spin_for(FOUND_BY_SERVER)
+        return client
+
+    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
+        """Call a service and return its response."""
+        client = self.client(service_type, name)
         future = client.call_async(request if request is not None else service_type.Request())
         self.wait_for(future.done)
         return future.result()
