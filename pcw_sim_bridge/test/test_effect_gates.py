@@ -61,7 +61,7 @@ def test_what_has_a_shape_of_its_own_needs_less_to_be_told_from_errors(term: dic
         terms=[SimpleNamespace(**term)], scale_deviation=0.0, measured=np.ones((2, 1)), valid=np.ones((2, 1), dtype=bool),
         misjudged=np.ones((2, 1)), drifts=np.ones((2, 1, 1)),
     )
-    nats = 0.5 * (settings.least_peculiar_torque + settings.least_peculiar)
+    nats = 0.5 * (settings.least_peculiar_unlike + settings.least_peculiar)
     regression = SimpleNamespace(peculiar=lambda change: nats)
     size, remains, none = np.array([0.5]), np.array([0.1]), np.array([0.0])
     share = EffectGates(problem, settings)._share(regression, [SimpleNamespace(term=0)], size[:, None], size, (remains, none))

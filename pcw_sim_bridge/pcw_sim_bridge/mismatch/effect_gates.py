@@ -150,9 +150,9 @@ class EffectGates:
     def _peculiarity(self, instances: Sequence[Instance]) -> float:
         """Nats beside the model's own errors from which a contribution is none of them."""
         if all(self._at_joints(instance) for instance in instances):
-            return self.settings.least_peculiar_torque
+            return self.settings.least_peculiar_unlike
         unlike = all(self._at_joints(i) or self.problem.terms[i.term].unlike_errors for i in instances)
-        least = self.settings.least_peculiar_torque if unlike else self.settings.least_peculiar
+        least = self.settings.least_peculiar_unlike if unlike else self.settings.least_peculiar
         return least * self._noise_factor(instances)
 
     def _at_joints(self, instance: Instance) -> bool:

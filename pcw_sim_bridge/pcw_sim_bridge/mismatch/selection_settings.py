@@ -20,8 +20,8 @@ class SelectionSettings:
             large effect is itself only known so well, and its error must not be named a further effect.
         least_peculiar: nats that a term smaller than what the model misjudges must have beside the model's own errors. What
             healthy robots in other simulations than the model were given wrongly stayed below half of it.
-        least_peculiar_torque: the same of torques at joints, which were given wrongly to none of them with 20, and of errors
-            of reading that turn with the joint and of play, where 46 healthy robots had no more than 15 and 26.
+        least_peculiar_unlike: the same of what has a shape that errors of the model have not: torques at joints, errors of
+            reading that turn with the joint, play.
         blocks: of the cross-validation.
         first_repeats: instances of a repeatable term in the first over-complete set; more would eat red noise line by line.
     """
@@ -32,7 +32,7 @@ class SelectionSettings:
     smallest_share: float = 0.25
     smallest_part: float = 0.02
     least_peculiar: float = 100.0
-    least_peculiar_torque: float = 50.0
+    least_peculiar_unlike: float = 50.0
     blocks: int = 10
     surrogates: int = 200
     largest_set: int = 16
