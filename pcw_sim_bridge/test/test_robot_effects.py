@@ -77,6 +77,31 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
     assert effect.parameters["direction"].value == pytest.approx(-2.0, abs=0.1)  # not 4.28, which is the same
 
 
+@pytest.mark.parametrize(
+    ("plant", "seed", "entry", "within"),
+    [
+        # Each of two tyre numbers of the description stands for the effect, at a price that is no effect's.
+        ("reduced", 5, {"name": "tyre_lateral_stiffness", "target": ["rear_left"], "error": -0.5}, 0.05),
+        # Two of these steerings do not turn once: no wave over their own angle can be told, but one that is there for all.
+        ("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
+                         "cosine": 0.03, "sine": -0.02}, 0.001),
+    ],
+    ids=["a tyre behind its own number", "coggings of all as one"],
+)  # fmt: skip
+def test_what_hid_is_named(plant: str, seed: int, entry: dict[str, object], within: float, tmp_path: Path) -> None:
+    """Nothing was missing, to say the one; two coggings and a law from outside, to say the other."""
+    excitation = make_excitation("identification", THESIS, 25.0, seed)
+    true_robot = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
+    record_run(true_robot, excitation.twist, excitation.duration, seed, tmp_path / "run", plant, controlled_as=THESIS)
+    findings = analyse(RobotSubject(THESIS), [tmp_path / "run"], [], {}, 0, lambda message: None).findings
+    [effect] = findings.effects
+    assert (effect.name, list(effect.target), findings.unknown) == (entry["name"], entry["target"], ())
+    for name in {"error", "cosine", "sine"} & set(entry):
+        found, true = effect.parameters[name], float(entry[name])  # type: ignore[arg-type]
+        assert abs(found.value - true) < within
+        assert found.low < true < found.high
+
+
 def test_play_lies_where_it_lay_while_next_to_no_torque_passes():
     """A wheel that rolls freely moves no gear: between its flanks by the torque's noise, play passed for a soft gear."""
     torque = np.array([0.0, 0.05, 1.0, 0.02, -0.03, 0.04, 1.0, -1.0, 0.02, -0.01, -1.0, 1.0, 0.0])

@@ -115,6 +115,13 @@ def hard_spot(state: PlantState, motor: np.ndarray) -> np.ndarray:
     return torque
 
 
+def uneven_gain(state: PlantState, motor: np.ndarray) -> np.ndarray:
+    """A motor 2 % stronger one way than the other; named a constant load by who does not look."""
+    torque = np.zeros((4, 2))
+    torque[0, 0] = -0.02 * abs(motor[0, 0])
+    return torque
+
+
 def record(path: Path, law: ExtraTorque | None, seed: int, monkeypatch: pytest.MonkeyPatch, excitation: str = "identification",
            duration: float = 25.0) -> Path:  # fmt: skip
     """A run of the thesis robot with a mass that is off within tolerance."""
@@ -161,6 +168,15 @@ def test_one_place_of_a_turn_is_no_row_of_coggings(tmp_path, monkeypatch):
     [unknown] = findings.unknown
     assert unknown.depends_on == ("drive_angle/rear_left", "drive_velocity/rear_left")
     assert unknown.share_explained > 0.8
+
+
+@pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.nightly), 4])
+def test_a_law_as_small_as_the_name_that_it_replaces_is_told_of(seed, tmp_path, monkeypatch):
+    """It lies below the noise, as the name does, and is held to be as small; seed 3 was nothing, seed 4 a constant load."""
+    findings = analysed(record(tmp_path / "run", uneven_gain, seed, monkeypatch)).findings
+    assert (findings.verdict, findings.effects) == ("unexplained", ())
+    [unknown] = findings.unknown
+    assert (unknown.channel, unknown.depends_on) == ("drive_torque/front_left", ("drive_torque/front_left",))
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ EFFECT = DescriptionEffect(
     target_kind="caster",
     axis="steer",
     summary="The tyre is stiffer or softer across than described; its peak friction is the same, at another slip.",
-    sentence="The tyre of {target} is stiffer across by {error:+.3g} of the described stiffness.",
+    sentence="The stiffness of the tyre of {target} across the wheel differs by {error:+.3g} of the described one.",
     # What a tyre slips is in proportion to the inverse of its stiffness.
     parameters=(
         EffectParameter(

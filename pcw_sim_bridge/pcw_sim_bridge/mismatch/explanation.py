@@ -29,7 +29,7 @@ from pcw_description.effects.registry import get
 from .effect_gates import EffectGates
 from .evidence_selection import EffectSearch, Selection
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
-from .regression_problem import HEALTHY, STRAINED, FloatArray, RegressionProblem, Term
+from .regression_problem import HEALTHY, LOOSE_STRAINED, STRAINED, FloatArray, RegressionProblem, Term
 from .selection_settings import SelectionSettings
 from .set_growth import Progress
 from .shape_search import refined_shape, shape_interval
@@ -207,7 +207,8 @@ def search_effects(
     search = EffectSearch(problem, rng, settings, progress)
     selection = search.run()
     strains = _strains(search.problem, selection.fit)
-    strained = {name: strain for name, strain in strains.items() if strain > STRAINED}
+    loose = {number.name for number in problem.nuisances if number.loose}
+    strained = {name: strain for name, strain in strains.items() if strain > (LOOSE_STRAINED if name in loose else STRAINED)}
     if not strained:
         return search, selection
     progress(f"once more with narrower tolerances of {', '.join(strained)}")
@@ -224,9 +225,8 @@ def search_effects(
 
 
 def _strains(problem: RegressionProblem, fit: Fit) -> dict[str, float]:
-    """By how many tolerances the numbers of the description come out of it, but for loose ones."""
-    numbers = zip(problem.nuisances, fit.mean, strict=False)
-    return {n.name: abs(float(mean)) / n.deviation for n, mean in numbers if not n.loose}
+    """By how many tolerances the numbers of the description come out of it."""
+    return {n.name: abs(float(mean)) / n.deviation for n, mean in zip(problem.nuisances, fit.mean, strict=False)}
 
 
 def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection:

@@ -44,6 +44,8 @@ SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
 KEPT_PART = 0.02
 # A law that replaces a name must differ from it by this part of what the name does.
 REPLACED_PART = 0.15
+# So much smaller than all that was measured a law may be expected to be that stands for a name.
+SMALLER_PARTS = (0.3, 0.1, 0.03, 0.01)
 MENDING_PART = 0.05
 # A law of a motor's own torque that takes away more of it than this only says that the joint does not accelerate.
 LARGEST_MOTOR_PART = 0.5
@@ -121,8 +123,16 @@ class LawSearch:
         fits = on_all_cores(lambda trial: trial.search.whiten_at(residual).fit(trial.instances), trials)
         order = np.argsort([-fit.log_evidence for fit in fits])
         weights = [fits[k].mean[-len(trial.instance.active) :] for k, trial in enumerate(trials)]
-        best = next((trials[k] for k in order if not self._undoes_a_motor(trials[k].law, weights[k])), None)
-        return None if best is None else self._judged(best)
+        ranked = [trials[k] for k in order if not self._undoes_a_motor(trials[k].law, weights[k])]
+        if not ranked:
+            return None
+        best = self._judged(ranked[0])
+        if best.counts:
+            return best
+        # What fits best may do so beside the names, as a detail; another may still be what a name stands for.
+        rivals = [self._judged(trial) for trial in ranked[1:] if len(trial.names) < len(self.names)]
+        doubts = [rival for rival in rivals if rival.withdrawn]
+        return min([best, *doubts], key=lambda found: (not found.counts, found.belief if found.withdrawn else 1.0))
 
     def _undoes_a_motor(self, law: Law, weights: FloatArray) -> bool:
         """Whether a law with weights (K,) takes away most of the motor's torque of which it is a function."""
@@ -146,8 +156,11 @@ class LawSearch:
         assert self.problem.sites is not None
         laws = [*hypotheses(self.problem.sites), *place_waves(self.problem, self.search.residual_of(self.names))]
         chosen: list[Law] = []
-        for scores in _Screen(self.search, laws).scores(list(dict.fromkeys([self.names, ()]))):
-            ranked = sorted((k for k, (gain, _) in enumerate(scores) if gain > 0.0), key=lambda k: -scores[k][0])
+        sets = list(dict.fromkeys([self.names, ()]))
+        for names, scores in zip(sets, _Screen(self.search, laws).scores(sets), strict=True):
+            # What may stand for a name need not look better than nothing here, where small effects drown in slow noise.
+            least = 0.0 if names == self.names else -math.inf
+            ranked = sorted((k for k, (gain, _) in enumerate(scores) if gain > least), key=lambda k: -scores[k][0])
             # Any drag is also a function of the torque that overcomes it, which must not crowd out what it really is.
             allowed = (laws[k] for k in ranked if not self._undoes_a_motor(laws[k], scores[k][1]))
             chosen += itertools.islice(allowed, FINALISTS)
@@ -191,7 +204,7 @@ class LawSearch:
             names = names[:index] + names[index + 1 :]
         return dataclasses.replace(trial, names=names)
 
-    def _judged(self, best: _Trial) -> FoundLaw | None:
+    def _judged(self, best: _Trial) -> FoundLaw:
         problem = best.search.problem
         regression = best.search.whiten_beside(best.instances)
         with_law, without = regression.fit(best.instances), regression.fit(self.names)
@@ -210,10 +223,12 @@ class LawSearch:
             < self.threshold - LAW_MARGIN
         }
         replaced = [i not in best.names and i not in idle for i in self.names]
-        sure = min(gain, held_out) >= self.threshold
+        dropped = tuple(i for i, replace in zip(self.names, replaced, strict=True) if replace)
+        if dropped:
+            gain += gain_of_a_smaller_law(regression, best.instances)
+        sure = min(gain, held_out) >= (LAW_MARGIN if dropped else self.threshold)
         counts = sure and self._matters(problem, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
-        dropped = tuple(i for i in self.names if i not in best.names and i not in idle)
         names, withdrawn = tuple(i for i in self.names if i not in dropped), dropped
         alike = bool(dropped) and (scores[1] - scores[0]) / both < KEPT_PART
         if alike and counts:
@@ -228,8 +243,8 @@ class LawSearch:
     def _matters(self, problem: RegressionProblem, with_law: Fit, without: Fit, dropped: Sequence[bool]) -> bool:
         """Whether the law moves the prediction of some channel by more than details and misjudgements of the model.
 
-        Against a name that it replaces it is enough to differ by a fair part of what the name does: the model misjudges
-        that by no more than it misjudges everything.
+        Against a name that it replaces it is enough to differ by a fair part of what the name does. That something is there
+        the name has shown; the model misjudges it by no more than it misjudges everything.
         """
         after = predicted(problem, with_law)
         change, left = after - predicted(problem, without), problem.residual - after
@@ -247,9 +262,11 @@ class LawSearch:
             sizes = [float(np.sqrt(np.mean(v[valid, channel] ** 2))) for v in (change, problem.measured, replaced)]
             size, signal, own = sizes
             enough = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
+            beside = robust_deviation(left[valid, channel])
             if own > 0.0:
-                enough = min(enough, max(REPLACED_PART * own, problem.scale_deviation * signal))
-            if size <= max(SMALLEST_SHARE * robust_deviation(left[valid, channel]), enough):
+                enough = min(enough, REPLACED_PART * own)
+                beside = min(beside, own)  # a name that lies below the noise gives way to a law that lies below it
+            if size <= max(SMALLEST_SHARE * beside, enough):
                 continue
             if problem.misjudged is None or size > float(np.sqrt(np.mean(problem.misjudged[valid, channel] ** 2))):
                 return True
@@ -294,6 +311,23 @@ def _held_out_error(regression: WhitenedRegression, instances: Sequence[Instance
         extended = np.append(-mean, 1.0)
         error += float(extended @ own @ extended)
     return error
+
+
+def gain_of_a_smaller_law(regression: WhitenedRegression, instances: Sequence[Instance]) -> float:
+    """What it gains [nats] to expect the law, the last instance, to be smaller than all that was measured.
+
+    A law beside the names must be a surprise. One in place of a name is expected to be as small as the name is.
+    """
+    gram, deviations = regression.grams(instances).sum(axis=0), regression.deviations(instances)
+    own = len(instances[-1].active)
+
+    def evidence(part: float) -> float:
+        scale = np.append(deviations[:-own], part * deviations[-own:])
+        factor = np.linalg.cholesky(gram[:-1, :-1] * np.outer(scale, scale) + np.eye(len(scale)))
+        half = np.linalg.solve(factor, gram[:-1, -1] * scale)
+        return float(0.5 * half @ half - np.sum(np.log(np.diag(factor))))
+
+    return max(0.0, max(evidence(part) for part in SMALLER_PARTS) - evidence(1.0) - math.log(len(SMALLER_PARTS)))
 
 
 class _Screened:

@@ -21,7 +21,7 @@ import numpy as np
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
-from .law_search import LAW_MARGIN, FoundLaw, LawSearch
+from .law_search import LAW_MARGIN, FoundLaw, LawSearch, gain_of_a_smaller_law
 from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem
@@ -159,12 +159,15 @@ def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> 
     """
     _, with_law = _with_law(search, selection, found.law, found.names)
     regression, names = with_law.regression, found.names
+    wanted = with_law.fit.log_evidence
+    if found.withdrawn:
+        wanted += gain_of_a_smaller_law(regression, with_law.fit.instances)
     for candidate in regression.scan(names, only=range(len(search.problem.terms)))[0][:LIBRARY_TRIALS]:
         if is_unknown(search.problem, candidate.instance) or search.repeats(candidate.instance, names):
             continue
         trial = (*names, refined_shape(regression, names, candidate.instance))
         fit = regression.fit(trial)
-        if fit.log_evidence < with_law.fit.log_evidence or not regression.within_bounds(fit):
+        if fit.log_evidence < wanted or not regression.within_bounds(fit):
             continue
         chosen = search.retuned_away(search.settle_on(search.conclude(trial, selection.threshold), selection.threshold))
         if any(instance.term == candidate.instance.term for instance in chosen.fit.instances):

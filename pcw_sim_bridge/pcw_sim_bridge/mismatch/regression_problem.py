@@ -31,8 +31,9 @@ WEAKER, POWERS = 0.8, (0.5, 3.0)
 NEARBY = 0.01  # part of its size by which an effect is changed for its derivative there
 PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
-# Tolerances beyond which a number is not a healthy system's, and beyond which none of a hundred numbers is by chance.
-HEALTHY, STRAINED = 3.0, 4.0
+# Tolerances beyond which a number is not a healthy system's, and beyond which none of a hundred numbers is by chance; a loose
+# one lies beyond the former often, and beyond the latter where something else is wrong.
+HEALTHY, STRAINED, LOOSE_STRAINED = 3.0, 4.0, 5.0
 
 UNKNOWN = "unknown"  # reserved in the vocabulary for what no entry explains
 
@@ -64,7 +65,7 @@ class Nuisance:
         deviation: standard deviation, same unit.
         column: d residual / d value, (T, C).
         changes: least and largest change that makes sense.
-        loose: a healthy one may be far beyond its tolerance, as of tyres: what the model misjudges of slips ends up there.
+        loose: a healthy one may be beyond its tolerance, as of tyres: what the model misjudges of slips ends up there.
         narrowed: part of the deviation that is allowed for, where an effect is looked for behind a number that strains it.
     """
 

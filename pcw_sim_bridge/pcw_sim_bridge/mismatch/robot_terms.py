@@ -57,6 +57,7 @@ class _TermMaker:
     def __init__(self, robot: RobotDescription, differences: ChannelDifferences, looked: Looked) -> None:
         self.robot, self.differences, self.looked = robot, differences, looked
         self.layout = differences.model.layout
+        self._of_joint: dict[tuple[int, int], Chosen] = {}
 
     def terms(self) -> list[Term]:
         """All candidates."""
@@ -155,19 +156,33 @@ class _TermMaker:
                 values = [parameter.default]
             elif parameter.unit == "rad/s":
                 values = [float(value) for value in np.geomspace(0.05, 0.5, 4) * top]
-            elif parameter.unit == "1/rad" and len(target) == 1:  # every motor has its own phase
-                chosen = self._orders(self.robot.caster_index(target[0]), axis)
+            elif parameter.unit == "1/rad":
+                chosen = self._common_orders([self.robot.caster_index(name) for name in target], axis)
                 values, among = [float(value) for value in chosen.values], chosen.among
             else:
                 return (), 0
             shapes = [{**shape, parameter.name: value} for shape in shapes for value in values]
         return tuple(shapes), among * max(len(shapes), 1)
 
+    def _common_orders(self, casters: Sequence[int], axis: int) -> Chosen:
+        """Orders of the ripples that some joints have in common, those that turned far enough to tell: the mean of theirs."""
+        each = {i: self._orders(i, axis) for i in casters}
+        first, *others = [i for i in casters if len(each[i].values)] or casters
+        widths = {i: math.tau / max(float(np.ptp(self.looked.angle[:, i, axis])), math.tau) for i in others}
+        common = []
+        for value in each[first].values:
+            nearest = {i: each[i].values[int(np.argmin(np.abs(each[i].values - value)))] for i in others}
+            if all(abs(found - value) < widths[i] for i, found in nearest.items()):
+                common.append(float(np.mean([value, *nearest.values()])))
+        return Chosen(np.array(common), max(chosen.among for chosen in each.values()))
+
     def _orders(self, i: int, axis: int) -> Chosen:
         """Orders of the ripples that a torque at one joint would have to have, to be in what is left."""
-        response = self.differences.of_unit_torque(i, axis)
-        held, _ = self.looked.held_against(response[:, :, None])
-        return orders(held[:, 0], self.looked.angle[:, i, axis], self.looked.rate)
+        if (i, axis) not in self._of_joint:
+            response = self.differences.of_unit_torque(i, axis)
+            held, _ = self.looked.held_against(response[:, :, None])
+            self._of_joint[i, axis] = orders(held[:, 0], self.looked.angle[:, i, axis], self.looked.rate)
+        return self._of_joint[i, axis]
 
     # -- everything else ----------------------------------------------------------------------------------------
 

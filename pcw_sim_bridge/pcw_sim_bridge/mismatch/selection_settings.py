@@ -32,7 +32,7 @@ class SelectionSettings:
     smallest_share: float = 0.25
     smallest_part: float = 0.02
     least_peculiar: float = 100.0
-    least_peculiar_unlike: float = 50.0
+    least_peculiar_unlike: float = 30.0
     blocks: int = 10
     surrogates: int = 200
     largest_set: int = 16
