@@ -80,7 +80,7 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("plant", "seed", "entry", "within"),
     [
-        # Each of two tyre numbers of the description stands for the effect, at a price that is no effect's.
+        # The description's own number of this tyre takes the effect in, and comes out many tolerances off.
         ("reduced", 5, {"name": "tyre_lateral_stiffness", "target": ["rear_left"], "error": -0.5}, 0.05),
         # Two of these steerings do not turn once: no wave over their own angle can be told, but one that is there for all.
         ("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,

@@ -7,7 +7,9 @@ are then fitted with exact columns, jointly with names and tolerances.
 
 A law counts if it beats the names, refined as far as they can be, by evidence and on held-out blocks, and moves the
 prediction by a part that matters. A name that it makes redundant is withdrawn, unless the name alone does most of what
-the law does: friction that varies by a tenth with the steering angle is friction and a leftover.
+the law does: friction that varies by a tenth with the steering angle is friction and a leftover. If the best law does not
+count, every other one that could stand for a name is judged, too: beside a name a law must be large to be told of, in its
+place it is expected as small as the name is.
 """
 
 from __future__ import annotations
@@ -204,15 +206,15 @@ class LawSearch:
             names = names[:index] + names[index + 1 :]
         return dataclasses.replace(trial, names=names)
 
-    def _judged(self, best: _Trial) -> FoundLaw:
-        problem = best.search.problem
-        regression = best.search.whiten_beside(best.instances)
-        with_law, without = regression.fit(best.instances), regression.fit(self.names)
+    def _judged(self, trial: _Trial) -> FoundLaw:
+        problem = trial.search.problem
+        regression = trial.search.whiten_beside(trial.instances)
+        with_law, without = regression.fit(trial.instances), regression.fit(self.names)
         gain = with_law.log_evidence - without.log_evidence
-        scores = [_held_out_error(regression, i) for i in (best.instances, self.names, best.names)]
+        scores = [_held_out_error(regression, i) for i in (trial.instances, self.names, trial.names)]
         held_out = 0.5 * (scores[1] - scores[0])
         self.search.progress(
-            f"outside the library: {' and '.join(best.law.sites)} by {', '.join(best.law.depends_on)}:"
+            f"outside the library: {' and '.join(trial.law.sites)} by {', '.join(trial.law.depends_on)}:"
             f" {gain:.1f} nats, held out {held_out:.1f}"
         )
         # A name that the recording does without anyway is nothing that a law could stand for.
@@ -222,10 +224,10 @@ class LawSearch:
             if without.log_evidence - regression.fit((*self.names[:index], *self.names[index + 1 :])).log_evidence
             < self.threshold - LAW_MARGIN
         }
-        replaced = [i not in best.names and i not in idle for i in self.names]
+        replaced = [i not in trial.names and i not in idle for i in self.names]
         dropped = tuple(i for i, replace in zip(self.names, replaced, strict=True) if replace)
         if dropped:
-            gain += gain_of_a_smaller_law(regression, best.instances)
+            gain += gain_of_a_smaller_law(regression, trial.instances)
         sure = min(gain, held_out) >= (LAW_MARGIN if dropped else self.threshold)
         counts = sure and self._matters(problem, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
@@ -235,7 +237,7 @@ class LawSearch:
             names, withdrawn = self.names, ()
         plain = {i.term: i for i in self.plain}
         return FoundLaw(
-            best.law, gain, held_out, min(both / max(scores[2], 1e-300), 1.0),
+            trial.law, gain, held_out, min(both / max(scores[2], 1e-300), 1.0),
             tuple(plain[i.term] if i.term in plain else i for i in names),
             tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
         )

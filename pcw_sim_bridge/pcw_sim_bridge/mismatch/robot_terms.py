@@ -167,13 +167,13 @@ class _TermMaker:
     def _common_orders(self, casters: Sequence[int], axis: int) -> Chosen:
         """Orders of the ripples that some joints have in common, those that turned far enough to tell: the mean of theirs."""
         each = {i: self._orders(i, axis) for i in casters}
-        first, *others = [i for i in casters if len(each[i].values)] or casters
-        widths = {i: math.tau / max(float(np.ptp(self.looked.angle[:, i, axis])), math.tau) for i in others}
+        able = [i for i in casters if len(each[i].values)]
+        widths = {i: math.tau / float(np.ptp(self.looked.angle[:, i, axis])) for i in able}
         common = []
-        for value in each[first].values:
-            nearest = {i: each[i].values[int(np.argmin(np.abs(each[i].values - value)))] for i in others}
+        for value in each[able[0]].values if able else ():
+            nearest = {i: each[i].values[int(np.argmin(np.abs(each[i].values - value)))] for i in able}
             if all(abs(found - value) < widths[i] for i, found in nearest.items()):
-                common.append(float(np.mean([value, *nearest.values()])))
+                common.append(float(np.mean(list(nearest.values()))))
         return Chosen(np.array(common), max(chosen.among for chosen in each.values()))
 
     def _orders(self, i: int, axis: int) -> Chosen:
