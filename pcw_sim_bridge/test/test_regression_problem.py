@@ -10,10 +10,12 @@ import pytest
 from scipy import signal
 
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, Selection
-from pcw_sim_bridge.mismatch.explanation import named_terms, search_effects
+from pcw_sim_bridge.mismatch.explanation import explain, named_terms, search_effects
 from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
+from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, shared_beliefs
 from pcw_sim_bridge.mismatch.regression_problem import (
+    UNKNOWN,
     Channel,
     LinearParameter,
     Nuisance,
@@ -607,3 +609,37 @@ def test_a_number_that_cannot_be_explains_nothing():
     left = 2.0 * np.sin(time) + 0.01 * np.random.default_rng(4).standard_normal(len(time))
     assert chosen(linear_problem(left, {"possible": (np.sin(time), 3.0)})) == ["possible"]
     assert chosen(linear_problem(left, {"impossible": (np.sin(time), 1.0)})) == []
+
+
+def test_an_effect_takes_over_what_the_same_number_has_of_it():
+    """It is 1.2 rad, not 1.1 beside a re-tuned zero; how much of it lies within the tolerance is left open."""
+    explanation = explain(turned_problem(1.2, 0.2), np.random.default_rng(0), SelectionSettings(surrogates=20))
+    (named,) = explanation.named
+    estimate = named.estimates["offset"]
+    assert estimate.value == pytest.approx(1.2, abs=0.01)
+    assert estimate.high - estimate.low == pytest.approx(2.0 * 1.96 * 0.2, rel=0.05)
+    assert explanation.fit.mean[0] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("argument", "powers", "shared"),
+    [("velocity", (1, 3), True), ("velocity", (3,), False), ("angle", (1, 3), False)],
+)
+def test_a_name_that_a_law_of_the_same_argument_can_hold_is_believed_by_half(argument, powers, shared):
+    """Which part of a curve of the speed is viscous friction nothing tells; a cube is none, nor what varies with an angle."""
+    rng = np.random.default_rng(2)
+    velocity = 2.0 * np.sin(np.arange(20 * SAMPLES) / RATE)
+    problem = one_channel(
+        velocity,
+        velocity + velocity**3 + NOISE * rng.standard_normal(len(velocity)),
+        nuisances=(),
+        terms=(
+            Term("friction", ("axis",), (LinearParameter("viscous", "1", -9.0, 9.0, 1.0),), ({},),
+                 lambda shape: velocity[:, None, None], arguments=("velocity",)),
+            Term(UNKNOWN, ("axis",), tuple(LinearParameter(f"weight_{k}", "", -9.0, 9.0, 1.0) for k in powers), ({},),
+                 lambda shape: np.stack([velocity**k for k in powers], axis=1)[:, None, :], arguments=(argument,)),
+        ),
+    )  # fmt: skip
+    search = EffectSearch(problem, np.random.default_rng(0))
+    selection = search.conclude((Instance(0, (), (0,)), Instance(1, (), tuple(range(len(powers))))), 5.0)
+    assert shared_beliefs(search, selection) == ({0: SHARED_BELIEF} if shared else {})

@@ -33,7 +33,7 @@ from .generated_effect import NoSuchKernelError, generate
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
-from .regression_problem import HEALTHY, STRAINED, FloatArray, RegressionProblem
+from .regression_problem import HEALTHY, STRAINED, TAKEN_OVER, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep
 from .subject import Subject
@@ -263,6 +263,8 @@ def _retuned(problem: RegressionProblem, fit: Fit) -> tuple[RetunedFinding, ...]
     # A red residual makes its own intervals narrow, and those of tolerances that it says nothing about.
     known = deviations * max(1.0, 1.0 / math.sqrt(max(fit.scale, 1e-12)))
     for nuisance, change, deviation, least in zip(problem.nuisances, fit.mean, deviations, known, strict=False):
+        if nuisance.narrowed == TAKEN_OVER:
+            continue
         moved = abs(change) > max(RETUNED_SIGNIFICANCE * deviation, 0.1 * nuisance.deviation)
         if moved or least < DETERMINED_PART * nuisance.deviation:
             value = nuisance.nominal + float(change)

@@ -90,7 +90,7 @@ class EffectGates:
     def _largest_burst(self, unexplained: FloatArray, at_work: BoolArray) -> float:
         """Most that is left unexplained (T,), beyond what noise leaves, anywhere in a time as long as one at work (T,)."""
         excess = unexplained - self.problem.valid.sum(axis=1) * float(np.sum(unexplained) / max(self.problem.valid.sum(), 1))
-        length = int(np.sum(at_work))
+        length = max(int(np.sum(at_work)), 1)  # a patch may lie where nobody came
         sums = np.cumsum(np.concatenate([[0.0], np.where(at_work, 0.0, excess)]))
         return float(np.max(sums[length:] - sums[:-length], initial=0.0))
 

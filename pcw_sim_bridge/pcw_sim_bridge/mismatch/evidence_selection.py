@@ -9,6 +9,7 @@
 4. Settle: make the problem exact at what is left, ask whether something that was dropped is missing now, and prune again.
 5. Ask whether fewer effects do as well from the description on, and whether one that looks like an effect does more.
 6. Ask of every effect whose work re-tuned numbers could do whether they do it as well once the problem is exact at those.
+7. Search the outlines of patches of floor.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from pcw_description.effects.registry import all_effects
 from .effect_gates import EffectGates
 from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
 from .noise_model import SLOW_ORDINATES
+from .outline_search import Outlines, has_outline, searched_outline
 from .regression_problem import FloatArray, RegressionProblem, segment_slices
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep, Progress, SetGrowth
@@ -38,6 +40,8 @@ FAR_MOVED = 2.0
 LEAST_STAND_IN = 30.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
+# So often the outline of a patch is searched, each time from where the last one was made exact.
+OUTLINE_ROUNDS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +79,10 @@ class EffectSearch(SetGrowth):
         self.description = problem
         # Log odds of a rival in place of a term that is named, both where they are exact: by (named, rival).
         self.where_exact: dict[tuple[int, int], float] = {}
+        # Outlines of patches of floor that were tried, by term.
+        self.outlines: dict[int, Outlines] = {}
+        # Tolerances of numbers that effects took over, by (term, parameter), as deviations of the coefficient.
+        self.taken_over: dict[tuple[int, int], float] = {}
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
         self.noise_gain = (0.0, 1.0)
 
@@ -102,7 +110,7 @@ class EffectSearch(SetGrowth):
                 break
         threshold = self.calibrate(regression, instances)
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
-        return self.bounded(self.retuned_away(self.against_alike(self.against_fewer(selection))))
+        return self.with_outlines(self.bounded(self.retuned_away(self.against_alike(self.against_fewer(selection)))))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
         """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
@@ -254,6 +262,37 @@ class EffectSearch(SetGrowth):
             if len(found) == MOST_ALIKE or candidate.gain < selection.losses[selection.fit.instances.index(own)] - FAR:
                 break
         return found
+
+    def with_outlines(self, selection: Selection) -> Selection:
+        """Exchange outlines of patches for those that fit best, and note all that were tried."""
+        for term in [instance.term for instance in selection.fit.instances if has_outline(instance)]:
+            for _ in range(OUTLINE_ROUNDS):
+                selection, gain = self._with_better_outline(selection, term)
+                # Far from where the problem is exact a first order misjudges what a patch does.
+                if gain < ALIKE:
+                    break
+        return selection
+
+    def _with_better_outline(self, selection: Selection, term: int) -> tuple[Selection, float]:
+        """The selection with the best outline of a patch, and what that gains [nats]; 0 where it has it already."""
+        instance = next((other for other in selection.fit.instances if other.term == term), None)
+        if instance is None:
+            return selection, 0.0
+        others = tuple(other for other in selection.fit.instances if other != instance)
+        around = self.problem.around(term, instance.shape)
+        regression = selection.regression.moved(around)
+        found, self.outlines[term] = searched_outline(regression, others, instance, self.outlines.get(term))
+        if found == instance:
+            return selection, 0.0
+        here, self.problem = (self.problem, self._point), around
+        chosen = self.made_exact((*others, found))
+        instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)
+        gain = self.advantage(instead, selection.fit.instances)
+        self.progress(f"{self.label(instance)} as {self.label(found)}: {gain:.1f} nats where exact")
+        if gain >= STEADY_EVIDENCE and any(other.term == term for other in instead.fit.instances):
+            return instead, gain
+        self.problem, self._point = here
+        return selection, 0.0
 
     def balanced(self, selection: Selection) -> Selection:
         """The selection with what an effect and a number of the description do alike shared out as their priors say.

@@ -28,11 +28,21 @@ from pcw_description.effects.registry import get
 
 from .effect_gates import EffectGates
 from .evidence_selection import EffectSearch, Selection
+from .noise_model import channel_deviations
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
-from .regression_problem import HEALTHY, LOOSE_STRAINED, STRAINED, FloatArray, RegressionProblem, Term
+from .outline_search import Outlines
+from .regression_problem import (
+    HEALTHY,
+    LOOSE_STRAINED,
+    STRAINED,
+    TAKEN_OVER,
+    FloatArray,
+    RegressionProblem,
+    Term,
+)
 from .selection_settings import SelectionSettings
 from .set_growth import Progress
-from .shape_search import refined_shape, shape_interval
+from .shape_search import DROP, refined_shape, shape_interval
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
@@ -41,6 +51,8 @@ AMBIGUOUS = 3.0
 REFINEMENT_LOG_PRIOR = -3.0
 # Half-width of 95 % of a Gaussian, in deviations.
 HALF_WIDTH = 1.96
+# Columns of an effect and of a number that are alike to this are those of one thing.
+SAME = 0.9999
 # An effect that hides behind a number leaves less than this part of its strain's square.
 RELIEF = 0.5
 
@@ -170,7 +182,7 @@ def explain(
             progress(f"not adopted: {suspect.describe()}")
     judgement = judge(search, selection)
     search, result = judgement.search, judgement.result
-    selection = search.balanced(judgement.selection)
+    selection = search.balanced(_taking_over(search, judgement.selection))
     problem = search.problem
     named = tuple(
         dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
@@ -245,6 +257,34 @@ def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection
         if loss < AMBIGUOUS and not search.repeats(rounded, others):
             instances = trial
     return selection if instances == selection.fit.instances else search.conclude(instances, selection.threshold)
+
+
+def _taking_over(search: EffectSearch, selection: Selection) -> Selection:
+    """The selection in which effects take over what numbers that are the same thing have of it.
+
+    A steering that is turned by 0.2 rad is said to be so, and not by 0.18 with a re-tuned zero for the rest: how much of it
+    lies within the tolerance nothing tells. That stays in the effect's interval.
+    """
+    description, fit = search.description, selection.fit
+    valid = description.valid
+    scale = np.where(valid, 1.0 / channel_deviations(description.residual, valid), 0.0)[:, :, None]
+    numbers = (description.nuisance_columns() * scale).reshape(valid.size, -1)
+    lengths = np.linalg.norm(numbers, axis=0)
+    held = {}
+    for instance in fit.instances:
+        if is_unknown(search.problem, instance):
+            continue
+        columns = (description.columns(instance.term, instance.shape) * scale).reshape(valid.size, -1)
+        for k in instance.active:
+            products, size = numbers.T @ columns[:, k], float(np.linalg.norm(columns[:, k]))
+            for j in np.flatnonzero(np.abs(products) > SAME * np.maximum(size * lengths, 1e-300)):
+                number = description.nuisances[j]
+                held[number.name] = (instance.term, k), abs(float(products[j])) / size**2 * number.deviation
+    if not held:
+        return selection
+    search.taken_over = dict(held.values())
+    search.problem = search.problem.narrowed(dict.fromkeys(held, TAKEN_OVER))
+    return search.conclude(search.made_exact(fit.instances), selection.threshold)
 
 
 def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
@@ -432,15 +472,19 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             value = float(fit.mean[parts].sum())
             variance = max(float(covariance[np.ix_(parts, parts)].sum()) for covariance in (known.covariance, misfit))
             power = problem.powers.get((instance.term, instance.shape, parameter_index), 1.0)
-            half = HALF_WIDTH * math.hypot(math.sqrt(variance), problem.scale_deviation * value / power)
+            within = search.taken_over.get((instance.term, parameter_index), 0.0)
+            half = HALF_WIDTH * math.hypot(math.sqrt(variance), within, problem.scale_deviation * value / power)
             low, high = parameter.interval(value - half, value + half)
             estimates[parameter.name] = Estimate(parameter.value(value), parameter.unit, low, high)
         others = fit.instances[:index] + fit.instances[index + 1 :]
         around = problem.around(instance.term, instance.shape)
         near = regression if around is problem else regression.moved(around)
+        wider = float(widening[position : position + active].max())
         for name, value in instance.shape:
-            low, high = shape_interval(near, others, instance, name, float(widening[position : position + active].max()))
+            low, high = shape_interval(near, others, instance, name, wider)
             estimates[name] = Estimate(value, "", low, high)
+        if instance.term in search.outlines:
+            estimates = _as_wide(estimates, term, instance, search.outlines[instance.term], DROP * wider)
         columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         contribution = columns @ fit.mean[position : position + active]
         position += active
@@ -458,6 +502,22 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             )
         )
     return _doubted_by_scale(named)
+
+
+def _as_wide(
+    estimates: Mapping[str, Estimate], term: Term, instance: Instance, outlines: Outlines, drop: float
+) -> dict[str, Estimate]:
+    """Estimates with intervals that hold at least those outlines of a patch, and their sizes, that do as well [nats]."""
+    shape, sizes = outlines.ranges(drop)
+    wanted = dict(shape)
+    for k, ends in zip(instance.active, sizes, strict=True):
+        parameter = term.parameters[k]
+        wanted[parameter.name] = parameter.interval(*(float(end) for end in ends))
+    return {
+        name: dataclasses.replace(e, low=min(e.low, *wanted[name]), high=max(e.high, *wanted[name]))
+        if name in wanted else e
+        for name, e in estimates.items()
+    }  # fmt: skip
 
 
 def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:

@@ -45,8 +45,10 @@ LARGEST_LAWS = 2
 LIBRARY_TRIALS = 3
 # So many variables of a channel are looked at closely, after a look at so many samples.
 MOST_PROMISING, PROMISING_SAMPLES = 4, 500
-# A closed form may leave this part more of what a curve explains.
-CLOSED_PART = 0.01
+# A closed form may leave this part more of what a curve explains; and this, if it does without a name that the curve needs.
+CLOSED_PART, SIMPLER_PART = 0.01, 0.05
+# What is left of the probability of a name that a curve of the same argument can hold to this part of its square.
+SHARED_BELIEF, HELD_PART = 0.5, 0.95
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +99,8 @@ class Judgement:
         search, selection: with laws that were found as further terms, called `UNKNOWN`.
         result: what is left, laws first.
         withdrawn: names that something left explains better: (label, variable).
-        beliefs: what is left of the probability of names, by term, that a law not sure enough to be told would withdraw.
+        beliefs: what is left of the probability of names, by term, that a law not sure enough to be told would withdraw, or
+            that a law beside them can hold.
     """
 
     search: EffectSearch
@@ -142,6 +145,7 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
     for label, variable in withdrawn:
         search.progress(f"withdrawn: {label}, the residual depends on {variable}")
     laws = [_law_leftover(search, selection, law, how) for law, how in found]
+    beliefs |= shared_beliefs(search, selection)
     return Judgement(
         search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs
     )
@@ -150,6 +154,34 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
 def is_unknown(problem: RegressionProblem, instance: Instance) -> bool:
     """Whether an instance is a law outside the library."""
     return problem.terms[instance.term].effect == UNKNOWN
+
+
+def shared_beliefs(search: EffectSearch, selection: Selection) -> dict[int, float]:
+    """What is left of the probability of names, by term, that a law of the same arguments beside them can hold.
+
+    Which part of a friction is viscous, and which an unknown function of the same speed, no recording can tell.
+    """
+    problem = search.problem
+    residual = search.residual_of(selection.fit.instances)
+    pairs = zip(residual.T, problem.valid.T, strict=True)
+    deviation = np.array([robust_deviation(left[valid]) if valid.any() else 1.0 for left, valid in pairs])
+    scale = np.where(problem.valid, 1.0 / deviation, 0.0)
+
+    def rows(instance: Instance) -> FloatArray:
+        columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
+        return (columns * scale[:, :, None]).reshape(scale.size, -1)
+
+    beliefs: dict[int, float] = {}
+    for law in (i for i in selection.fit.instances if is_unknown(problem, i)):
+        arguments, functions = set(problem.terms[law.term].arguments), rows(law)
+        for name in selection.fit.instances:
+            if is_unknown(problem, name) or not arguments <= set(problem.terms[name.term].arguments):
+                continue
+            own = rows(name)
+            left = own - functions @ np.linalg.lstsq(functions, own, rcond=1e-9)[0]
+            if np.sum(left**2) < (1.0 - HELD_PART) * np.sum(own**2):
+                beliefs[name.term] = SHARED_BELIEF
+    return beliefs
 
 
 def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> Selection | None:
@@ -191,10 +223,13 @@ def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tup
     residuals.append(search.residual_of(found.names))
     deviation = np.array([robust_deviation(residuals[0][valid[:, c], c]) for c in range(valid.shape[1])])
     sizes = [float(np.sum(np.where(valid, residual / deviation, 0.0) ** 2)) for residual in residuals]
-    if sizes[1] - sizes[0] < CLOSED_PART * (sizes[2] - sizes[0]):
+    part = (sizes[1] - sizes[0]) / max(sizes[2] - sizes[0], 1e-300)
+    if part < SIMPLER_PART:
         law = _without_what_names_hold(*closed, law, form)
-        search, selection = _with_law(search, selection, law, found.names)
-        return search, _without_redundant(search, selection), law
+        closed = _with_law(search, selection, law, found.names)
+        simpler = _without_redundant(*closed)
+        if part < CLOSED_PART or len(simpler.fit.instances) <= len(found.names):
+            return closed[0], simpler, law
     if found.law.basis.kind == "periodic":
         law = dataclasses.replace(found.law, basis=fourier(found.law.basis))
         return *_with_law(search, selection, law, found.names), law
@@ -232,7 +267,8 @@ def _with_law(
     """Fit names and law jointly."""
     problem = search.problem.with_terms([law.term(search.problem)])
     wider = EffectSearch(problem, search.rng, search.settings, search.progress)
-    wider.noise_gain, wider.ladder, wider.where_exact = search.noise_gain, search.ladder, search.where_exact
+    wider.noise_gain, wider.ladder = search.noise_gain, search.ladder
+    wider.where_exact, wider.outlines = search.where_exact, search.outlines
     instance = Instance(len(problem.terms) - 1, (), tuple(range(len(problem.terms[-1].parameters))))
     return wider, wider.conclude((*names, instance), selection.threshold)
 

@@ -28,6 +28,7 @@ IntArray = npt.NDArray[np.int64]
 CURVED_FROM = 0.01
 # The power of its size that an effect is in proportion to is taken from this part of it to all of it, within these.
 WEAKER, POWERS = 0.8, (0.5, 3.0)
+TAKEN_OVER = 1e-4  # part of its tolerance that a number keeps which an effect has taken over
 NEARBY = 0.01  # part of its size by which an effect is changed for its derivative there
 PROPORTIONAL = 0.01  # an effect whose work departs by less from being in proportion to its size has its derivative at it
 
@@ -66,7 +67,8 @@ class Nuisance:
         column: d residual / d value, (T, C).
         changes: least and largest change that makes sense.
         loose: a healthy one may be beyond its tolerance, as of tyres: what the model misjudges of slips ends up there.
-        narrowed: part of the deviation that is allowed for, where an effect is looked for behind a number that strains it.
+        narrowed: part of the deviation that is allowed for: where an effect is looked for behind a number that strains it, and
+            `TAKEN_OVER` where an effect is named that is the same thing.
     """
 
     name: str

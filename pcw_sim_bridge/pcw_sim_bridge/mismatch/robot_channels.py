@@ -54,6 +54,9 @@ SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slip
 SHAKEN_PART = 0.05  # of the samples in which wheels shake is worth a word
 # What every model has a little wrong, of each wheel by itself, and not always by as much.
 DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_lateral_stiffness")
+# Part of a tolerance over which a number's column is taken anew: by a wider one's curvature an effect on it would be told
+# from the number itself, which is the same thing.
+TANGENT_STEP = 0.01
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
 
@@ -173,7 +176,7 @@ class RobotProblemBuilder:
         if model is None:
             return None
         there = ChannelDifferences(model, self._motions_of(model), self.filters)
-        columns = on_all_cores(lambda n: there.of_numbers(n.vary, 0.5 * n.deviation), varied)
+        columns = on_all_cores(lambda n: there.of_numbers(n.vary, TANGENT_STEP * n.deviation), varied)
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
         return found | {nuisance.name: nuisance.column for nuisance in floor_nuisances(self.robot, there)}
 

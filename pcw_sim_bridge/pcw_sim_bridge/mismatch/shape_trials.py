@@ -7,7 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import linalg
 
+from .regression_problem import FloatArray
 from .whitened_regression import Instance, WhitenedRegression, marginal_gains
+
+AT_ONCE = 64  # instances whose columns are held at a time
 
 
 class ShapeTrials:
@@ -34,11 +37,7 @@ class ShapeTrials:
 
     def evidence(self, instances: Sequence[Instance]) -> list[tuple[float, bool]]:
         """Log evidence of the set with each of some instances of that term, and whether its parameters are within bounds."""
-        pieces = self.regression.tried_columns(instances)
-        columns = np.concatenate(pieces, axis=1)
-        cross = linalg.solve_triangular(self._factor, self._design.T @ columns, lower=True)
-        moment = columns.T @ self.regression.target[:, None]
-        own = np.stack([piece.T @ piece for piece in pieces])
+        own, cross, moment = self._products(instances)
         if self.whole:
             size = own[:, 0, 0] - np.sum(cross**2, axis=0)
             product = moment[:, 0] - (cross.T @ self._projected)[:, 0]
@@ -52,3 +51,18 @@ class ShapeTrials:
             (self._without + float(gain) - instance.occam, bool(within))
             for instance, gain, within in zip(instances, gains[:, 0], allowed, strict=True)
         ]
+
+    def coefficients(self, instances: Sequence[Instance]) -> FloatArray:
+        """Return what the active parameters of each come out as (len(instances), P)."""
+        found = []
+        for start in range(0, len(instances), AT_ONCE):
+            own, cross, moment = self._products(instances[start : start + AT_ONCE])
+            found.append(marginal_gains(own, cross, moment, self._projected, self._deviations)[1][:, :, 0])
+        return np.concatenate(found)
+
+    def _products(self, instances: Sequence[Instance]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Gram matrices of the columns of each instance, and their products with the set and with the target."""
+        pieces = self.regression.tried_columns(instances)
+        columns = np.concatenate(pieces, axis=1)
+        cross = linalg.solve_triangular(self._factor, self._design.T @ columns, lower=True)
+        return np.stack([piece.T @ piece for piece in pieces]), cross, columns.T @ self.regression.target[:, None]

@@ -1,0 +1,208 @@
+"""Where the borders of a patch of floor are: searched from many outlines, since most of them fit where wheels crossed one.
+
+A few wheels cross a patch here and there. From the place that a first look finds an outline is led to the next one that
+fits there, and a disc never becomes the turned rectangle that fits better: the way from one to the other leads through what
+fits worse. So ellipses and rectangles of several directions and sizes are tried, and the best are moved border by border.
+
+What was tried on the way says also how well the outline is known: every one that fits nearly as well may be the true one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy import optimize
+
+from .regression_problem import FloatArray
+from .shape_trials import ShapeTrials
+from .whitened_regression import Instance, WhitenedRegression
+
+OUTLINE = ("x", "y", "length", "width", "yaw", "roundness")
+DIRECTIONS = (0.0, math.pi / 6.0, math.pi / 3.0)
+SIDES = (0.6, 0.85, 1.2)  # of the sides of the outline that was found
+# The best of them are moved far, and the best of those are moved more finely.
+STARTS, FINALISTS = 6, 2
+# Borders are moved by these parts of a side, the direction by twice as many radians, as long as that gains.
+FAR_STEPS, FINE_STEPS = (0.4, 0.2, 0.1), (0.05, 0.025)
+MOVES = 6
+WORTH = 0.3  # nats
+# So many outlines that are about as good as the best, and so many times others between and beyond them.
+POPULATION, GENERATIONS = 40, 40
+AS_GOOD = 1.0  # nats
+WORST = 1e12  # instead of an outline that cannot be
+NARROWEST = 0.05  # [m], about a tyre's contact patch
+NEARLY = 3.0  # nats below the best that an outline of an earlier search may have been
+MOST_BEFORE = 200  # outlines of an earlier search that are looked at again
+FAR = 50.0  # nats below the best that nobody asks for
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlines:
+    """Outlines of one patch that were tried.
+
+    Attributes:
+        outlines: (N, 6), in the order of `OUTLINE`.
+        evidence: (N,) [nats].
+        coefficients: of the effect's active parameters (N, P).
+    """
+
+    outlines: FloatArray
+    evidence: FloatArray
+    coefficients: FloatArray
+
+    def ranges(self, drop: float) -> tuple[Mapping[str, tuple[float, float]], FloatArray]:
+        """How far apart those are that are no more than this below the best [nats].
+
+        Returns:
+            Smallest and largest value of each number of the outline, by name, and of each coefficient (P, 2).
+        """
+        near = self.evidence >= self.evidence.max() - drop
+        low, high = self.outlines[near].min(axis=0), self.outlines[near].max(axis=0)
+        sizes = self.coefficients[near]
+        shape = {name: (float(a), float(b)) for name, a, b in zip(OUTLINE, low, high, strict=True)}
+        return shape, np.stack([sizes.min(axis=0), sizes.max(axis=0)], axis=1)
+
+
+def has_outline(instance: Instance) -> bool:
+    """Whether an effect is at work on a patch of floor."""
+    return set(OUTLINE) <= dict(instance.shape).keys()
+
+
+def searched_outline(
+    regression: WhitenedRegression, others: Sequence[Instance], instance: Instance, before: Outlines | None = None
+) -> tuple[Instance, Outlines]:
+    """Return the instance with the outline that explains most beside others, and all that were tried.
+
+    Args:
+        before: what an earlier search found alike, under another fit.
+    """
+    trials = _Tried(ShapeTrials(regression, others, instance), instance)
+    own = np.array([dict(instance.shape)[name] for name in OUTLINE])
+    starts = [own, *_starts(own)]
+    if before is not None:
+        near = before.outlines[before.evidence > before.evidence.max() - NEARLY]
+        starts += list(near[:: math.ceil(len(near) / MOST_BEFORE)])
+    order = 1 + np.argsort([-value for value in trials.evidence(starts)[1:]])
+    reached = [trials.climb(starts[k], FAR_STEPS) for k in (0, *order[:STARTS])]
+    for _, outline in sorted(reached, key=lambda end: -end[0])[:FINALISTS]:
+        trials.climb(outline, FINE_STEPS)
+    trials.spread([*(outline for _, outline in reached), *(starts[k] for k in order)])
+    return trials.best(), trials.all_tried()
+
+
+def _starts(own: FloatArray) -> list[FloatArray]:
+    """Ellipses and rectangles about the middle of an outline."""
+    found = []
+    for roundness, yaw, length, width in itertools.product((0.0, 1.0), DIRECTIONS, SIDES, SIDES):
+        if not (roundness == 1.0 and yaw > 0.0 and length == width and own[2] == own[3]):
+            found.append(np.array([*own[:2], length * own[2], width * own[3], own[4] + yaw, roundness]))
+    return found
+
+
+class _Tried:
+    """Evidence of outlines, each asked for once."""
+
+    def __init__(self, trials: ShapeTrials, instance: Instance) -> None:
+        self._trials, self._instance = trials, instance
+        self._known: dict[tuple[float, ...], float] = {}
+
+    def evidence(self, outlines: Sequence[FloatArray]) -> list[float]:
+        """Log evidence of each; none where the size of the effect would have to be one that cannot be."""
+        keys = [tuple(outline.tolist()) for outline in outlines]
+        new = [key for key in dict.fromkeys(keys) if key not in self._known]
+        found = self._trials.evidence([self._with(key) for key in new]) if new else []
+        for key, (value, allowed) in zip(new, found, strict=True):
+            self._known[key] = value if allowed else -math.inf
+        return [self._known[key] for key in keys]
+
+    def climb(self, outline: FloatArray, steps: Sequence[float]) -> tuple[float, FloatArray]:
+        """Move borders, middle and direction of an outline as long as one of these gains; the evidence and where it ends."""
+        best = self.evidence([outline])[0]
+        for step in steps:
+            for _ in range(MOVES):
+                moved = [_allowed(outline + part * step * way) for way in _ways(outline) for part in (-1.0, -0.5, 0.5, 1.0)]
+                evidence = self.evidence(moved)
+                k = int(np.argmax(evidence))
+                gain = evidence[k] - best
+                if gain > 0.0:
+                    outline, best = moved[k], evidence[k]
+                if not gain > WORTH:
+                    break
+        return best, outline
+
+    def spread(self, others: Sequence[FloatArray]) -> None:
+        """Go on along all that is about as good as the best: differences between outlines lead from one to the next.
+
+        Borders make up for each other, so that what fits is a narrow ridge, which no change of one number follows.
+
+        Args:
+            others: far from each other, to begin with beside some of the best.
+        """
+        tried = sorted(self._known, key=lambda key: -self._known[key])
+        near = [key for key in tried if self._known[key] > self._known[tried[0]] - FAR]
+        some = near[:: max(1, 2 * len(near) // POPULATION)][: POPULATION // 2]
+        population = np.array([*some, *(tuple(outline) for outline in others)][:POPULATION])
+        middle, side = population[0, :2], float(population[:, 2:4].max())
+        low = np.array([*(middle - 2.0 * side), NARROWEST, NARROWEST, -2.0 * math.pi, 0.0])
+        high = np.array([*(middle + 2.0 * side), 3.0 * side, 3.0 * side, 2.0 * math.pi, 1.0])
+
+        def cost(outlines: FloatArray) -> FloatArray:
+            return np.nan_to_num(-np.array(self.evidence(list(outlines.T))), posinf=WORST)
+
+        optimize.differential_evolution(
+            cost, list(zip(low, high, strict=True)), init=np.clip(population, low, high), strategy="rand1bin",
+            maxiter=GENERATIONS, mutation=(0.3, 1.9), recombination=0.9, tol=0.0, polish=False, seed=0,
+            vectorized=True, updating="deferred",
+        )  # fmt: skip
+
+    def best(self) -> Instance:
+        """The instance with the smallest of the best outlines: where nobody came there need not be any of it."""
+        own = tuple(dict(self._instance.shape)[name] for name in OUTLINE)
+        least = max(self._known.values()) - AS_GOOD
+        key = min((key for key, value in self._known.items() if value >= least), key=lambda key: key[2] * key[3])
+        return self._instance if key == own else self._with(_upright(key))
+
+    def all_tried(self) -> Outlines:
+        """All that are not far below the best."""
+        best = max(self._known.values())
+        keys = [key for key, value in self._known.items() if value > best - FAR]
+        coefficients = self._trials.coefficients([self._with(key) for key in keys])
+        evidence = np.array([self._known[key] for key in keys])
+        return Outlines(np.array([_upright(key) for key in keys]), evidence, coefficients)
+
+    def _with(self, outline: Sequence[float]) -> Instance:
+        shape = dict(self._instance.shape) | dict(zip(OUTLINE, outline, strict=True))
+        return self._trials.regression.with_shape(self._instance, shape)
+
+
+def _ways(outline: FloatArray) -> list[FloatArray]:
+    """Changes of an outline per part of its mean side: of one border, the middle, a side about the middle, the direction."""
+    side = 0.5 * (outline[2] + outline[3])
+    c, s = side * math.cos(outline[4]), side * math.sin(outline[4])
+    return [
+        np.array(way)
+        for way in (
+            (0.5 * c, 0.5 * s, side, 0.0, 0.0, 0.0), (-0.5 * c, -0.5 * s, side, 0.0, 0.0, 0.0),
+            (-0.5 * s, 0.5 * c, 0.0, side, 0.0, 0.0), (0.5 * s, -0.5 * c, 0.0, side, 0.0, 0.0),
+            (c, s, 0.0, 0.0, 0.0, 0.0), (-s, c, 0.0, 0.0, 0.0, 0.0),
+            (0.0, 0.0, side, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, side, 0.0, 0.0),
+            (0.0, 0.0, 0.0, 0.0, 2.0, 0.0),
+        )
+    ]  # fmt: skip
+
+
+def _allowed(outline: FloatArray) -> FloatArray:
+    return np.concatenate([outline[:2], np.maximum(outline[2:4], NARROWEST), outline[4:]])
+
+
+def _upright(outline: Sequence[float]) -> tuple[float, ...]:
+    """The same outline with the longer side as its length, and a direction from -pi/2 to pi/2."""
+    x, y, length, width, yaw, roundness = outline
+    if width > length:
+        length, width, yaw = width, length, yaw + 0.5 * math.pi
+    return x, y, length, width, math.remainder(yaw, math.pi), roundness
+

@@ -1,0 +1,130 @@
+"""Outlines of patches of floor, found from what wheels feel that cross them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.explanation import named_terms
+from pcw_sim_bridge.mismatch.outline_search import OUTLINE, has_outline, searched_outline
+from pcw_sim_bridge.mismatch.regression_problem import Channel, LinearParameter, RegressionProblem, Term
+from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
+
+NOISE = 0.05
+DISC = {"x": 0.05, "y": 0.05, "length": 0.5, "width": 0.5, "yaw": 0.0, "roundness": 1.0}
+
+
+def inside(places: np.ndarray, outline: dict[str, float]) -> np.ndarray:
+    """1 within a rectangle, an ellipse or what lies between, 0 outside, over a border of 2 cm; places (T, 2)."""
+    c, s = math.cos(outline["yaw"]), math.sin(outline["yaw"])
+    apart = places - [outline["x"], outline["y"]]
+    along = np.abs(apart @ [c, s]) / (0.5 * outline["length"])
+    across = np.abs(apart @ [-s, c]) / (0.5 * outline["width"])
+    power = 2.0 / max(outline["roundness"], 0.04)
+    radius = np.minimum((np.minimum(along, 9.0) ** power + np.minimum(across, 9.0) ** power) ** (1.0 / power), 9.0)
+    return np.clip(0.5 + (1.0 - radius) * 0.5 * min(outline["length"], outline["width"]) / 0.02, 0.0, 1.0)
+
+
+def tracks(lines: int) -> np.ndarray:
+    """Places (T, 2) [m] of a wheel that crosses a floor of 2 m by 2 m to and fro, first along it, then across."""
+    along = np.linspace(-1.0, 1.0, 200)
+    rows = [np.column_stack([along, np.full_like(along, y)]) for y in np.linspace(-0.93, 0.97, lines)]
+    return np.concatenate([*rows, *(row[:, ::-1] for row in rows)])
+
+
+def floor_problem(places: np.ndarray, outline: dict[str, float], size: float) -> RegressionProblem:
+    """A patch that moves one channel by so much, beside white noise."""
+    rng = np.random.default_rng(1)
+    residual = (size * inside(places, outline) + NOISE * rng.standard_normal(len(places)))[:, None]
+    time = np.arange(len(places)) / 50.0
+    grid = {"x": ("linear", 0.1), "y": ("linear", 0.1), "length": ("log", 1.6), "width": ("log", 1.6)}
+    return RegressionProblem(
+        channels=(Channel("axis_force", "N"),), time=time, segment=np.zeros(len(time), dtype=np.int64),
+        recording=np.zeros(len(time), dtype=np.int64), rate=50.0, measured=residual, residual=residual,
+        valid=np.ones_like(residual, dtype=bool), nuisances=(), variables={"time": time},
+        terms=(
+            Term(
+                "patch", ("axis",), (LinearParameter("size", "1", -10.0, 10.0, 1.0),), (DISC,),
+                lambda shape: inside(places, shape)[:, None, None], resolution=grid, once=True,
+            ),
+        ),
+    )  # fmt: skip
+
+
+def shaped(outline: dict[str, float]) -> Instance:
+    """The patch of that outline."""
+    return Instance(0, tuple(sorted(outline.items())), (0,))
+
+
+@pytest.mark.parametrize(
+    "outline",
+    [
+        {"x": 0.1, "y": 0.02, "length": 0.66, "width": 0.38, "yaw": 0.7, "roundness": 0.0},
+        {"x": 0.03, "y": 0.12, "length": 0.8, "width": 0.5, "yaw": -0.5, "roundness": 1.0},
+        {"x": 0.05, "y": 0.05, "length": 0.45, "width": 0.45, "yaw": 0.0, "roundness": 1.0},
+    ],
+)
+def test_the_outline_of_a_patch_is_found_from_that_of_a_disc(outline):
+    """A turned rectangle, a turned ellipse, a disc; from the place and size of a first look."""
+    problem = floor_problem(tracks(24), outline, 0.3)
+    regression = EffectSearch(problem, np.random.default_rng(0)).whiten_at(problem.residual)
+    found, tried = searched_outline(regression, (), shaped(DISC))
+    shape = dict(found.shape)
+    # Tracks are 8 cm apart; a border is known to a part of that.
+    for name in ("x", "y", "length", "width"):
+        assert shape[name] == pytest.approx(outline[name], abs=0.06), name
+    assert shape["roundness"] == pytest.approx(outline["roundness"], abs=0.4)
+    if outline["length"] > outline["width"]:
+        assert shape["yaw"] == pytest.approx(outline["yaw"], abs=0.12)
+    # Not by chance: the true one is hardly better.
+    trials = ShapeTrials(regression, (), found)
+    best, true = (evidence for evidence, _ in trials.evidence([found, shaped(outline)]))
+    assert best > true - 2.0
+    assert best <= tried.evidence.max() + 1e-6
+
+
+def test_where_few_wheels_crossed_a_patch_its_interval_holds_what_else_it_may_be():
+    """One track each way: discs and rectangles of many directions do. Beside them each interval was below a centimetre."""
+    outline = {"x": 0.2, "y": 0.1, "length": 0.9, "width": 0.7, "yaw": 0.4, "roundness": 0.0}
+    problem = floor_problem(tracks(3), outline, 0.3)
+    search = EffectSearch(problem, np.random.default_rng(0))
+    selection = search.with_outlines(search.conclude((shaped(DISC),), 5.0))
+    assert set(search.outlines) == {0}
+    estimates = named_terms(search, selection)[0].estimates
+    for name in OUTLINE[:4]:
+        assert estimates[name].value == pytest.approx(outline[name], abs=0.15), name
+    assert estimates["y"].high - estimates["y"].low > 0.02
+    assert estimates["yaw"].high - estimates["yaw"].low > 0.1
+    assert estimates["size"].low < 0.3 < estimates["size"].high
+
+
+def test_a_patch_where_nobody_came_is_nothing():
+    """A shape may be asked for beside all tracks: it is worth nothing, and no error."""
+    problem = floor_problem(tracks(3), DISC, 0.3)
+    search = EffectSearch(problem, np.random.default_rng(0))
+    selection = search.conclude((shaped(DISC | {"x": 0.5, "y": 0.5, "length": 0.2, "width": 0.2}),), 5.0)
+    assert selection.losses == (pytest.approx(0.0, abs=1e-6),)
+
+
+def test_what_was_tried_is_told_upright():
+    """The longer side is the length, and a direction one of half a turn: one outline has one name."""
+    outline = {"x": 0.0, "y": 0.0, "length": 0.4, "width": 0.8, "yaw": 2.0, "roundness": 0.0}
+    problem = floor_problem(tracks(24), outline, 0.3)
+    regression = EffectSearch(problem, np.random.default_rng(0)).whiten_at(problem.residual)
+    found, tried = searched_outline(regression, (), shaped(outline | {"x": 0.03}))
+    shape = dict(found.shape)
+    assert (shape["length"], shape["width"]) == (pytest.approx(0.8, abs=0.04), pytest.approx(0.4, abs=0.04))
+    assert shape["yaw"] == pytest.approx(2.0 - 0.5 * math.pi, abs=0.1)
+    assert np.all(tried.outlines[:, 2] >= tried.outlines[:, 3])
+    assert np.all(np.abs(tried.outlines[:, 4]) <= 0.5 * math.pi)
+
+
+def test_only_patches_have_an_outline():
+    """A push has a start and a duration."""
+    assert has_outline(shaped(DISC))
+    assert not has_outline(Instance(0, (("duration", 0.2), ("start", 3.0)), (0,)))
+    assert not has_outline(Instance(0, (), (0,)))
