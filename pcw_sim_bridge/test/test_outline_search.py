@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -108,6 +109,15 @@ def test_a_patch_where_nobody_came_is_nothing():
     search = EffectSearch(problem, np.random.default_rng(0))
     selection = search.conclude((shaped(DISC | {"x": 0.5, "y": 0.5, "length": 0.2, "width": 0.2}),), 5.0)
     assert selection.losses == (pytest.approx(0.0, abs=1e-6),)
+
+
+def test_no_outline_is_searched_for_a_patch_that_cannot_be():
+    """Its size would have to be of the other sign: whatever outline came out would be as wrong."""
+    problem = floor_problem(tracks(12), DISC, -0.3)
+    positive = dataclasses.replace(problem.terms[0].parameters[0], lower=0.0)
+    problem = dataclasses.replace(problem, terms=(dataclasses.replace(problem.terms[0], parameters=(positive,)),))
+    regression = EffectSearch(problem, np.random.default_rng(0)).whiten_at(problem.residual)
+    assert searched_outline(regression, (), shaped(DISC)) == (shaped(DISC), None)
 
 
 def test_what_was_tried_is_told_upright():

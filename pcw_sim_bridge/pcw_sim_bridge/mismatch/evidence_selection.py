@@ -281,7 +281,9 @@ class EffectSearch(SetGrowth):
         others = tuple(other for other in selection.fit.instances if other != instance)
         around = self.problem.around(term, instance.shape)
         regression = selection.regression.moved(around)
-        found, self.outlines[term] = searched_outline(regression, others, instance, self.outlines.get(term))
+        found, tried = searched_outline(regression, others, instance, self.outlines.get(term))
+        if tried is not None:
+            self.outlines[term] = tried
         if found == instance:
             return selection, 0.0
         here, self.problem = (self.problem, self._point), around

@@ -74,14 +74,18 @@ def has_outline(instance: Instance) -> bool:
 
 def searched_outline(
     regression: WhitenedRegression, others: Sequence[Instance], instance: Instance, before: Outlines | None = None
-) -> tuple[Instance, Outlines]:
+) -> tuple[Instance, Outlines | None]:
     """Return the instance with the outline that explains most beside others, and all that were tried.
+
+    Where the effect itself would have to be of a size that cannot be, nothing is searched.
 
     Args:
         before: what an earlier search found alike, under another fit.
     """
     trials = _Tried(ShapeTrials(regression, others, instance), instance)
     own = np.array([dict(instance.shape)[name] for name in OUTLINE])
+    if not math.isfinite(trials.evidence([own])[0]):
+        return instance, before
     starts = [own, *_starts(own)]
     if before is not None:
         near = before.outlines[before.evidence > before.evidence.max() - NEARLY]

@@ -517,9 +517,10 @@ class RegressionProblem:
 
     def narrowed(self, parts: Mapping[str, float]) -> RegressionProblem:
         """Return the problem with parts of the tolerances of some numbers, by name."""
-        return dataclasses.replace(
-            self, nuisances=tuple(dataclasses.replace(n, narrowed=parts.get(n.name, n.narrowed)) for n in self.nuisances)
-        )
+        numbers = tuple(dataclasses.replace(n, narrowed=parts.get(n.name, n.narrowed)) for n in self.nuisances)
+        narrower = dataclasses.replace(self, nuisances=numbers)
+        narrower._remembered.update(self._remembered)
+        return narrower
 
 
 def segment_slices(segment: IntArray) -> list[slice]:
