@@ -167,6 +167,7 @@ def test_changes_of_ground_are_found_and_settled():
     found = terrain_study.change_times(range(50))
     assert found.detected.max() <= 0.3
     assert np.mean(found.settled <= 0.8) >= 0.97
+    assert np.mean(found.within <= 0.8) >= 0.99 and (found.within <= found.settled).all()
 
 
 @pytest.mark.parametrize("seed", [51052, 51097, 51163])
