@@ -172,3 +172,10 @@ def joint_torque_along(kernel, position, velocity, motor_torque, normal_force, p
             position[index], velocity[index], motor_torque[index], normal_force[index], parameters
         )
     return torque
+
+
+@compiled_for_kernel(ARRAY_SIGNATURE, "void", "float64[:, ::1], float64[::1], float64[:, ::1]")
+def array_kernel_along(kernel, at, parameters, results):  # type: ignore[no-untyped-def]
+    """Let a kernel of arrays add to each row of `results` what it finds at the same row of `at`."""
+    for index in range(len(at)):
+        kernel(at[index], parameters, results[index])

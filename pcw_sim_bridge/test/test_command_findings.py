@@ -18,9 +18,9 @@ from pcw_sim_bridge.mismatch.whitened_regression import Instance
 ROBOT = load_robot("dyros_pcv")
 
 
-def found(*effects):
-    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), effects)
-    return command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None)
+def found(*effects, robot=ROBOT):
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "identification", 15.0, 3), effects)
+    return command_findings(command_problems(robot, [recording]), (), 0, None, lambda message: None)
 
 
 @pytest.mark.parametrize(
@@ -50,6 +50,18 @@ def test_a_dead_time_that_reaches_a_little_into_a_cycle_is_one_and_as_long_as_it
     estimate = named.estimates["delay"]
     assert estimate.value == pytest.approx(delay, rel=0.02)
     assert 0.0 < estimate.high - estimate.low < 0.05 * delay
+
+
+def test_a_dead_time_that_reaches_a_little_into_the_second_cycle_is_none_of_a_single_one():
+    """At 250 Hz one of 7.1 ms is one of a cycle, 4 to 7 ms, and a tenth of another. With no time on the grid between 6.3 and
+    8.2 ms it was said to be 3.864 ms, give or take 0.010.
+    """
+    robot = load_robot("tidybot2")
+    concealed = EffectInstance("actuator_delay", robot.caster_names, {"delay": 0.0071}, "steer")
+    [(named, instance)] = found(concealed, robot=robot).named
+    assert (instance.name, instance.axis) == ("actuator_delay", "steer")
+    estimate = named.estimates["delay"]
+    assert estimate.low < 0.0071 < estimate.high and estimate.value == pytest.approx(0.0071, rel=0.02)
 
 
 @pytest.mark.parametrize(("part_of_a_delay", "doubted"), [(90.0, True), (-2.0, True), (-20.0, False)])

@@ -102,6 +102,29 @@ def test_what_hid_is_named(plant: str, seed: int, entry: dict[str, object], with
         assert found.low < true < found.high
 
 
+@pytest.mark.parametrize(
+    ("entry", "within"),
+    [
+        # Its ends fell on samples of the motion: 23 ms beside the truth, said to be known to 6.
+        ({"name": "external_push", "force_x": 20.0, "force_y": 8.0, "start": 7.2137, "duration": 3.0411}, 0.003),
+        # A wheel that gives way hands a part of its load to the others; 12 % too stiff, said to be known to 3.
+        ({"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 50e3}, 1500.0),
+    ],
+    ids=["a push between samples", "a wheel that gives way"],
+)  # fmt: skip
+def test_numbers_are_as_exact_as_they_are_said_to_be(entry: dict[str, object], within: float, tmp_path: Path) -> None:
+    excitation = make_excitation("identification", THESIS, 25.0, 4)
+    true_robot = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
+    record_run(true_robot, excitation.twist, excitation.duration, 4, tmp_path / "run", "reduced", controlled_as=THESIS)
+    [effect] = analyse(RobotSubject(THESIS), [tmp_path / "run"], [], {}, 0, lambda message: None).findings.effects
+    assert effect.name == entry["name"]
+    for name in {"start", "duration", "stiffness"} & set(entry):
+        found, true = effect.parameters[name], float(entry[name])  # type: ignore[arg-type]
+        print(f"{name}: {true}, found {found.value:.6g} ({found.low:.6g} to {found.high:.6g})")
+        assert abs(found.value - true) < within
+        assert found.low < true < found.high
+
+
 def test_play_lies_where_it_lay_while_next_to_no_torque_passes():
     """A wheel that rolls freely moves no gear: between its flanks by the torque's noise, play passed for a soft gear."""
     torque = np.array([0.0, 0.05, 1.0, 0.02, -0.03, 0.04, 1.0, -1.0, 0.02, -0.01, -1.0, 1.0, 0.0])

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import joint_torque_along
+from ..compiled import array_kernel_along, joint_torque_along
 from ..robot_description import RobotDescription
 from .effect import Effect, FloatArray
 
@@ -173,9 +173,8 @@ class ChassisForceEffect(Effect):
 
     def contribution(self, at: FloatArray, parameters: Values) -> FloatArray:
         """Evaluate the kernel along rows `at` (T, FORCE_INPUTS); result (T, FORCE_RESULTS) [N, N m]."""
-        values, total = self.values(parameters), np.zeros((len(at), FORCE_RESULTS))
-        for row, result in zip(np.ascontiguousarray(at, dtype=float), total, strict=True):
-            self.wrench(row, values, result)
+        total = np.zeros((len(at), FORCE_RESULTS))
+        array_kernel_along(self.wrench, np.ascontiguousarray(at, dtype=float), self.values(parameters), total)
         return total
 
     def regressor(self, at: FloatArray, parameters: Values) -> dict[str, FloatArray]:

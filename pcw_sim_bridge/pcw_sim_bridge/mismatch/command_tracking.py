@@ -42,8 +42,10 @@ LATENCY_PART = 0.1
 PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
-# A dead time shows once it reaches into the last step of a cycle, at first in proportion to how far: by these parts of a step.
+# A dead time shows once it reaches into the last step of a cycle, or of one before, and as far as that step only in proportion
+# to how far: by these parts of a step, in so many cycles.
 REACHES = (0.03, 0.08, 0.2, 0.5)
+CYCLES_BACK = 3
 CYCLES = 2  # so many different lengths of cycles are looked at: 3 and 4 ms at 300 Hz among steps of 1 ms
 # Torques at which a drive may give no more, by how much of the time more was asked of it.
 LARGEST_QUANTILES = (0.8, 0.95, 0.99, 0.999)
@@ -249,11 +251,12 @@ class _JointProblem:
         return tuple(shapes), resolution
 
     def _reaching(self) -> list[float]:
-        """Times [s] that reach a little into the last step of the commonest cycles."""
+        """Times [s] that reach a little into the last step of one of the commonest cycles, or of several one after another."""
         step, steps = _steps(max(self.pieces, key=lambda piece: len(piece.time)))
         lengths, counts = np.unique(steps, return_counts=True)
         common = lengths[np.argsort(-counts, kind="stable")[:CYCLES]]
-        return [float(step * (length - 1 + part)) for length in common for part in REACHES]
+        whole = sorted({int(length * back) for length in common for back in range(1, CYCLES_BACK + 1)})
+        return [float(step * (steps_back - 1 + part)) for steps_back in whole for part in REACHES]
 
     def _variables(self) -> dict[str, FloatArray]:
         return {

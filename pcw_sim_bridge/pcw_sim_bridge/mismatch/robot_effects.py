@@ -71,6 +71,10 @@ from .signal_filter import SignalFilter, derivative
 Sides = tuple[FloatArray, FloatArray]
 # A gear's play changes sides once its torque is this part of its size the other way: below it are noise and free rolling.
 PLAY_TORQUE = 0.1
+# How often a wheel's load and what it does to the wheel are found from each other, down to so many metres.
+LOAD_ROUNDS, LEAST_LIFT = 6, 1e-6
+# What begins between two samples of a motion is seen so many times between them.
+BETWEEN_SAMPLES = 12
 
 
 def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
@@ -215,15 +219,55 @@ def _later(motion: RobotMotion, values: FloatArray, offset: float) -> FloatArray
     ARRAY_SIGNATURE, "float64[:, ::1]", "float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[::1]"
 )
 def _contacts_along(kernel, values, time, place, roll_angle, load):  # type: ignore[no-untyped-def]
-    """Results (T, CONTACT_RESULTS) of a contact's kernel under one wheel that is at place (T, 2)."""
-    found = np.zeros((len(time), CONTACT_RESULTS))
+    """Results (T, CONTACT_RESULTS) of a contact's kernel under one wheel that is at place (T, 2).
+
+    Where a wheel comes upon other ground between two samples, they have the mean of the friction on the way.
+    """
+    count = len(time)
+    found = np.zeros((count, CONTACT_RESULTS))
     at = np.zeros(CONTACT_INPUTS)
-    for t in range(len(time)):
+    for t in range(count):
         found[t, FRICTION] = 1.0
         at[CONTACT_TIME], at[CONTACT_X], at[CONTACT_Y] = time[t], place[t, 0], place[t, 1]
         at[ROLL_ANGLE], at[LOAD] = roll_angle[t], load[t]
         kernel(at, values, found[t])
+    friction = found[:, FRICTION].copy()
+    one = np.zeros(CONTACT_RESULTS)
+    for t in range(count):
+        before, after = max(t - 1, 0), min(t + 1, count - 1)
+        if friction[before] == friction[t] == friction[after]:
+            continue
+        total = 0.0
+        for k in range(BETWEEN_SAMPLES):
+            way = (k + 0.5) / BETWEEN_SAMPLES - 0.5
+            other = after if way > 0.0 else before
+            part = abs(way)
+            at[CONTACT_TIME] = time[t] + part * (time[other] - time[t])
+            at[CONTACT_X] = place[t, 0] + part * (place[other, 0] - place[t, 0])
+            at[CONTACT_Y] = place[t, 1] + part * (place[other, 1] - place[t, 1])
+            at[ROLL_ANGLE] = roll_angle[t] + part * (roll_angle[other] - roll_angle[t])
+            at[LOAD] = load[t] + part * (load[other] - load[t])
+            one[:] = 0.0
+            one[FRICTION] = 1.0
+            kernel(at, values, one)
+            total += one[FRICTION]
+        found[t, FRICTION] = total / BETWEEN_SAMPLES
     return found
+
+
+def _lift(found: FloatArray) -> FloatArray:
+    """How much higher a wheel's axle is (T,) [m] by what was found under it (T, CONTACT_RESULTS)."""
+    lift: FloatArray = found[:, HEIGHT] + found[:, RADIUS_CHANGE]
+    return lift
+
+
+def _between_samples(rows: FloatArray) -> FloatArray:
+    """Return what lies about the samples of rows (T, K), (T * BETWEEN_SAMPLES, K), as many to either side of each."""
+    way = (np.arange(BETWEEN_SAMPLES) + 0.5) / BETWEEN_SAMPLES - 0.5
+    places = np.clip(np.arange(len(rows))[:, None] + way, 0.0, len(rows) - 1.0).ravel()
+    first = np.minimum(places.astype(np.int64), max(len(rows) - 2, 0))
+    part = (places - first)[:, None]
+    return (1.0 - part) * rows[first] + part * rows[np.minimum(first + 1, len(rows) - 1)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,19 +310,14 @@ class ChannelModel:
                     position = self.numbers.headings(motion.position)[:, i]
                 torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
             return dataclasses.replace(around, torque=torque)
+        under, normal = self._under_wheels(motion, around, instance, normal)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
         grip = np.ones(shape[:2]) if around.grip is None else around.grip.copy()
         height = np.zeros(shape[:2]) if around.height is None else around.height.copy()
-        under = {
-            i: self._under_wheel(motion, effect, i, instance.parameters, normal)
-            for i in map(self.robot.caster_index, instance.target)
-        }
         for i, found in under.items():
             radius[:, i] += found[:, RADIUS_CHANGE]
             grip[:, i] *= found[:, FRICTION]
-            height[:, i] += found[:, HEIGHT] + found[:, RADIUS_CHANGE]
-        if height.any():
-            normal = normal_along(motion, self.numbers, height)
+            height[:, i] += _lift(found)
         climb = around.climb
         for i, found in under.items():
             torque[:, i, DRIVE] -= normal[:, i] * found[:, RADIUS_SLOPE]
@@ -303,14 +342,34 @@ class ChannelModel:
         places: FloatArray = motion.pose[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
         return places
 
-    def _under_wheel(
-        self, motion: RobotMotion, effect: ContactEffect, i: int, values: Mapping[str, float], normal: FloatArray
-    ) -> FloatArray:
-        found: FloatArray = _contacts_along(
-            effect.contact, effect.values(values), motion.time, self.wheel_places(motion, i),
-            np.ascontiguousarray(motion.position[:, i, DRIVE]), np.ascontiguousarray(normal[:, i]),
-        )  # fmt: skip
-        return found
+    def _under_wheels(
+        self, motion: RobotMotion, around: Surroundings, instance: EffectInstance, normal: FloatArray
+    ) -> tuple[dict[int, FloatArray], FloatArray]:
+        """What a contact's effect does under each of its wheels (T, CONTACT_RESULTS), and the normal forces then (T, n) [N].
+
+        A wheel that gives way under its load hands a part of it to the others, and gives way less.
+        """
+        effect = get(instance.name)
+        assert isinstance(effect, ContactEffect)
+        values = effect.values(instance.parameters)
+        casters = [self.robot.caster_index(name) for name in instance.target]
+        places = {i: self.wheel_places(motion, i) for i in casters}
+        height = np.zeros(motion.position.shape[:2])
+        for _ in range(LOAD_ROUNDS):
+            under = {
+                i: _contacts_along(
+                    effect.contact, values, motion.time, places[i],
+                    np.ascontiguousarray(motion.position[:, i, DRIVE]), np.ascontiguousarray(normal[:, i]),
+                )
+                for i in casters
+            }  # fmt: skip
+            before, height = height, np.zeros(motion.position.shape[:2]) if around.height is None else around.height.copy()
+            for i, found in under.items():
+                height[:, i] += _lift(found)
+            if np.abs(height - before).max(initial=0.0) < LEAST_LIFT:
+                break
+            normal = normal_along(motion, self.numbers, height)
+        return under, normal
 
     def _in_wheel_frame(self, motion: RobotMotion, i: int, vectors: FloatArray) -> FloatArray:
         """Vectors of the world (T, 2) in the frame of wheel i (T, 2)."""
@@ -356,8 +415,8 @@ class ChannelModel:
         """Change both sides as an effect on forces, gravity, IMU or clocks does; other kinds change nothing here."""
         layout = self.layout
         if isinstance(effect, ChassisForceEffect) and layout.balanced:
-            wrench = effect.contribution(self._at(motion), values)
-            measured[:, :3] += wrench[:, [0, 1, 5]]
+            wrench = effect.contribution(_between_samples(self._at(motion)), values)
+            measured[:, :3] += wrench[:, [0, 1, 5]].reshape(-1, BETWEEN_SAMPLES, 3).mean(axis=1)
         elif isinstance(effect, GravityEffect):
             self.lean(motion, effect.gravity(values), measured, predicted)
         elif isinstance(effect, ImuEffect) and layout.imu:
