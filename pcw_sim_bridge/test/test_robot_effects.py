@@ -125,6 +125,28 @@ def test_numbers_are_as_exact_as_they_are_said_to_be(entry: dict[str, object], w
         assert found.low < true < found.high
 
 
+def test_noise_of_reported_torques_scales_nothing(tmp_path: Path) -> None:
+    """Steering motors that are 13 % weak were drives that are 17 % strong and a payload of 9 kg: forces and loads that are all
+    larger predict slips with less of the torques' noise in them, and gains of what was reported hold that noise themselves.
+    """
+    concealed = [
+        {"name": "torque_constant_error", "target": [*DYROS.caster_names], "axis": "steer", "error": -0.13},
+        {"name": "drive_coulomb_friction", "target": [DYROS.caster_names[0]], "coulomb": 0.08},
+    ]
+    true_robot = dataclasses.replace(DYROS, physics=read_physics(concealed, DYROS.caster_names))
+    excitation = make_excitation("identification", DYROS, 30.0, 8)
+    record_run(true_robot, excitation.twist, excitation.duration, 8, tmp_path / "run", "reduced", controlled_as=DYROS)
+    findings = analyse(RobotSubject(DYROS), [tmp_path / "run"], [], {}, 0, lambda message: None).findings
+    found = {effect.name: effect for effect in findings.effects}
+    assert set(found) == {entry["name"] for entry in concealed}
+    for entry, name in zip(concealed, ("error", "coulomb"), strict=True):
+        effect = found[str(entry["name"])]
+        estimate = effect.parameters[name]
+        print(f"{effect.statement} {estimate.value:.4g} ({estimate.low:.4g} to {estimate.high:.4g})")
+        assert list(effect.target) == entry["target"] and str(entry.get("axis", "drive")) in effect.statement
+        assert estimate.low < float(str(entry[name])) < estimate.high
+
+
 def test_play_lies_where_it_lay_while_next_to_no_torque_passes():
     """A wheel that rolls freely moves no gear: between its flanks by the torque's noise, play passed for a soft gear."""
     torque = np.array([0.0, 0.05, 1.0, 0.02, -0.03, 0.04, 1.0, -1.0, 0.02, -0.01, -1.0, 1.0, 0.0])

@@ -268,6 +268,8 @@ class RegressionProblem:
             the names of the nuisances that it holds; None from it where there is no such model, and instead of it where the
             columns are exact everywhere.
         derive: (changes, sizes) -> columns of nuisances there, by name; None where `exact` is.
+        slackened: changes -> factors (C,) by which what torques do is more, in each channel, with the tyres as soft as they
+            are there, and the nuisances that are torques, too; None where nothing rolls.
         nominal: residual of the description as it is, where `residual` is exact elsewhere; point: where.
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
@@ -292,6 +294,7 @@ class RegressionProblem:
     sites: Sites | None = None
     exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
     derive: Callable[[Mapping[str, float], Sequence[SizedTerm]], Mapping[str, FloatArray] | None] | None = None
+    slackened: Callable[[Mapping[str, float]], tuple[FloatArray, Sequence[str]]] | None = None
     nominal: FloatArray | None = None
     point: Point | None = None
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
@@ -421,6 +424,30 @@ class RegressionProblem:
         moved._remembered.update(self._remembered)
         return moved
 
+    def with_soft_tyres(self) -> RegressionProblem:
+        """Return the problem in which torques, of effects and of numbers, make tyres slip that are as soft as it is exact at.
+
+        How soft tyres are nobody knows to a third, and so little is it known in the columns of the description.
+        """
+        if self.slackened is None or self.point is None:
+            return self
+        factors, numbers = self.slackened(self.point.changes)
+        residual, nuisances = self.residual, []
+        for nuisance in self.nuisances:
+            column = nuisance.column * factors if nuisance.name in numbers else nuisance.column
+            residual = residual + (column - nuisance.column) * self.point.changes.get(nuisance.name, 0.0)
+            nuisances.append(dataclasses.replace(nuisance, column=column))
+        terms = tuple(
+            dataclasses.replace(
+                term, columns=_multiplied(term.columns, factors[:, None]),
+                scan=None if term.scan is None else _multiplied(term.scan, factors[:, None, None]),
+            ) if term.is_exact and not term.is_curved else term
+            for term in self.terms
+        )  # fmt: skip
+        moved = dataclasses.replace(self, residual=residual, nuisances=tuple(nuisances), terms=terms)
+        moved._remembered.update(self._without(*(k for k, term in enumerate(terms) if term is not self.terms[k])))
+        return moved
+
     def tangent(self) -> RegressionProblem:
         """Return the problem with all columns as they are where it is exact, for what numbers are known to there.
 
@@ -521,6 +548,11 @@ class RegressionProblem:
         narrower = dataclasses.replace(self, nuisances=numbers)
         narrower._remembered.update(self._remembered)
         return narrower
+
+
+def _multiplied(columns: Callable[..., FloatArray], factors: FloatArray) -> Callable[..., FloatArray]:
+    """The function of columns with factors on what it returns."""
+    return lambda *arguments: columns(*arguments) * factors
 
 
 def segment_slices(segment: IntArray) -> list[slice]:

@@ -142,6 +142,7 @@ class RobotProblemBuilder:
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
             exact=functools.partial(self._exact, differences, terms),
             derive=functools.partial(self._derive, differences, terms),
+            slackened=self._slackened if self.layout.balanced else None,
             remarks=self._remarks(),
         )
 
@@ -179,6 +180,15 @@ class RobotProblemBuilder:
         columns = on_all_cores(lambda n: there.of_numbers(n.vary, TANGENT_STEP * n.deviation), varied)
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
         return found | {nuisance.name: nuisance.column for nuisance in floor_nuisances(self.robot, there)}
+
+    def _slackened(self, changes: Mapping[str, float]) -> tuple[FloatArray, Sequence[str]]:
+        """Factors (C,) on what torques do to the channels with softer tyres, and the numbers that are torques.
+
+        What is not a balance of forces shows them by the slips that they cause alone.
+        """
+        factors = np.full(len(self.channels()), 1.0 + changes.get("contact.stiffness", 0.0))
+        factors[:3] = 1.0
+        return factors, [name for name in changes if name.startswith("torque_constant/")]
 
     def _model_at(
         self,

@@ -118,11 +118,12 @@ def _entry(name: str, index: Index | None = None) -> Vary:
     return vary
 
 
-def _scaled(column: int, nominal: float) -> Vary:
-    """Vary a column of the modules' numbers in proportion."""
+def _scaled(column: int, nominal: float, described: FloatArray) -> Vary:
+    """Vary a column of the modules' numbers in proportion to what is described (n,), wherever they are by now."""
+    relative = described / nominal
 
     def vary(numbers: ModelNumbers, step: float) -> None:
-        numbers.modules[:, column] *= 1.0 + step / nominal
+        numbers.modules[:, column] += step * relative
 
     return vary
 
@@ -159,8 +160,8 @@ def _radius(index: int) -> Vary:
 def _gain(index: int, axis: int) -> Vary:
     """Vary a torque constant against the mean of all.
 
-    What they share cannot be told from the masses. Left free it would be fitted below its value, since whoever scales
-    down all measured forces scales down their noise with them.
+    What they share cannot be told from the masses. Left free it would, where no commands tell a torque without its noise, be
+    fitted below its value, since whoever scales down all measured forces scales down their noise with them.
     """
 
     def vary(numbers: ModelNumbers, step: float) -> None:
@@ -233,7 +234,7 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
         ("module.inertia_zz", 3, first.module.inertia_zz),
         ("wheel.inertia_axle", 4, first.wheel.inertia_axle),
     ):
-        yield label, label, nominal, _scaled(column, nominal)
+        yield label, label, nominal, _scaled(column, nominal, numbers.modules[:, column].copy())
     for axis, rotor in enumerate(AXIS_NAMES):
         armature = rotor_armature(robot, axis)
         if armature[0, axis, axis] > 0.0:

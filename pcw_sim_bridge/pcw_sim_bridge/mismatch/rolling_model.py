@@ -710,17 +710,21 @@ def rolling_state(
     patches[:, LAMBDA] *= numbers.softness[:n, 0]  # the edge of a patch slips as the tyre does
     spin = _scrub(patches, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
     if layout.balanced:
-        torque = (motion.torque + numbers.torque_lag * motion.torque_rate) * numbers.gain
-        if around.torque is not None:
-            torque = torque + around.torque
+        # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads
+        # of tyres, would be found as small, or as large, as makes that noise least.
+        added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
+        added += (numbers.gain - 1.0) * motion.quiet_torque
         if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
-            torque = torque.copy()
-            torque[:, :, DRIVE] += radius * around.climb[:, :, 0]
-        load = _contact_forces(
-            numbers.modules, numbers.steer_axis, offset, radius, direction, velocity, motion.acceleration, torque, spin,
-            twist, felt, normal, tilt,
+            added[:, :, DRIVE] += radius * around.climb[:, :, 0]
+        load, force = (
+            _contact_forces(
+                numbers.modules, numbers.steer_axis, offset, radius, direction, velocity, motion.acceleration, torque + added,
+                spin, twist, felt, normal, tilt,
+            )
+            for torque in (motion.torque + numbers.torque_lag * motion.torque_rate, motion.quiet_torque)
         )  # fmt: skip
-        force = load if around.climb is None else load - around.climb
+        if around.climb is not None:
+            force = force - around.climb
     else:
         wrench = inertial_wrench(numbers, motion, direction, twist, felt)
         if around.climb is not None:
