@@ -268,8 +268,8 @@ class RegressionProblem:
             the names of the nuisances that it holds; None from it where there is no such model, and instead of it where the
             columns are exact everywhere.
         derive: (changes, sizes) -> columns of nuisances there, by name; None where `exact` is.
-        slackened: changes -> factors (C,) by which what torques do is more, in each channel, with the tyres as soft as they
-            are there, and the nuisances that are torques, too; None where nothing rolls.
+        softened: changes -> factors (C,) on what torques do to each channel where the tyres are as soft as these changes make
+            them, and names of the nuisances that are torques; None where nothing rolls.
         nominal: residual of the description as it is, where `residual` is exact elsewhere; point: where.
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
@@ -294,7 +294,7 @@ class RegressionProblem:
     sites: Sites | None = None
     exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
     derive: Callable[[Mapping[str, float], Sequence[SizedTerm]], Mapping[str, FloatArray] | None] | None = None
-    slackened: Callable[[Mapping[str, float]], tuple[FloatArray, Sequence[str]]] | None = None
+    softened: Callable[[Mapping[str, float]], tuple[FloatArray, Sequence[str]]] | None = None
     nominal: FloatArray | None = None
     point: Point | None = None
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
@@ -429,9 +429,9 @@ class RegressionProblem:
 
         How soft tyres are nobody knows to a third, and so little is it known in the columns of the description.
         """
-        if self.slackened is None or self.point is None:
+        if self.softened is None or self.point is None:
             return self
-        factors, numbers = self.slackened(self.point.changes)
+        factors, numbers = self.softened(self.point.changes)
         residual, nuisances = self.residual, []
         for nuisance in self.nuisances:
             column = nuisance.column * factors if nuisance.name in numbers else nuisance.column

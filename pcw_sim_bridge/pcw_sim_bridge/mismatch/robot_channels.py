@@ -142,7 +142,7 @@ class RobotProblemBuilder:
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
             exact=functools.partial(self._exact, differences, terms),
             derive=functools.partial(self._derive, differences, terms),
-            slackened=self._slackened if self.layout.balanced else None,
+            softened=self._softened if self.layout.balanced else None,
             remarks=self._remarks(),
         )
 
@@ -181,7 +181,7 @@ class RobotProblemBuilder:
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
         return found | {nuisance.name: nuisance.column for nuisance in floor_nuisances(self.robot, there)}
 
-    def _slackened(self, changes: Mapping[str, float]) -> tuple[FloatArray, Sequence[str]]:
+    def _softened(self, changes: Mapping[str, float]) -> tuple[FloatArray, Sequence[str]]:
         """Factors (C,) on what torques do to the channels with softer tyres, and the numbers that are torques.
 
         What is not a balance of forces shows them by the slips that they cause alone.

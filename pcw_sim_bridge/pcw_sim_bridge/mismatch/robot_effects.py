@@ -255,12 +255,6 @@ def _contacts_along(kernel, values, time, place, roll_angle, load):  # type: ign
     return found
 
 
-def _lift(found: FloatArray) -> FloatArray:
-    """How much higher a wheel's axle is (T,) [m] by what was found under it (T, CONTACT_RESULTS)."""
-    lift: FloatArray = found[:, HEIGHT] + found[:, RADIUS_CHANGE]
-    return lift
-
-
 def _between_samples(rows: FloatArray) -> FloatArray:
     """Return what lies about the samples of rows (T, K), (T * BETWEEN_SAMPLES, K), as many to either side of each."""
     way = (np.arange(BETWEEN_SAMPLES) + 0.5) / BETWEEN_SAMPLES - 0.5
@@ -310,14 +304,12 @@ class ChannelModel:
                     position = self.numbers.headings(motion.position)[:, i]
                 torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
             return dataclasses.replace(around, torque=torque)
-        under, normal = self._under_wheels(motion, around, instance, normal)
+        under, height, normal = self._under_wheels(motion, around, instance, normal)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
         grip = np.ones(shape[:2]) if around.grip is None else around.grip.copy()
-        height = np.zeros(shape[:2]) if around.height is None else around.height.copy()
         for i, found in under.items():
             radius[:, i] += found[:, RADIUS_CHANGE]
             grip[:, i] *= found[:, FRICTION]
-            height[:, i] += _lift(found)
         climb = around.climb
         for i, found in under.items():
             torque[:, i, DRIVE] -= normal[:, i] * found[:, RADIUS_SLOPE]
@@ -344,10 +336,13 @@ class ChannelModel:
 
     def _under_wheels(
         self, motion: RobotMotion, around: Surroundings, instance: EffectInstance, normal: FloatArray
-    ) -> tuple[dict[int, FloatArray], FloatArray]:
-        """What a contact's effect does under each of its wheels (T, CONTACT_RESULTS), and the normal forces then (T, n) [N].
+    ) -> tuple[dict[int, FloatArray], FloatArray, FloatArray]:
+        """What a contact's effect does under each of its wheels, and what that does to all of them.
 
         A wheel that gives way under its load hands a part of it to the others, and gives way less.
+
+        Returns:
+            By wheel (T, CONTACT_RESULTS); heights of the axles (T, n) [m] and normal forces (T, n) [N] with it at work.
         """
         effect = get(instance.name)
         assert isinstance(effect, ContactEffect)
@@ -365,11 +360,11 @@ class ChannelModel:
             }  # fmt: skip
             before, height = height, np.zeros(motion.position.shape[:2]) if around.height is None else around.height.copy()
             for i, found in under.items():
-                height[:, i] += _lift(found)
+                height[:, i] += found[:, HEIGHT] + found[:, RADIUS_CHANGE]
             if np.abs(height - before).max(initial=0.0) < LEAST_LIFT:
                 break
             normal = normal_along(motion, self.numbers, height)
-        return under, normal
+        return under, height, normal
 
     def _in_wheel_frame(self, motion: RobotMotion, i: int, vectors: FloatArray) -> FloatArray:
         """Vectors of the world (T, 2) in the frame of wheel i (T, 2)."""
