@@ -148,14 +148,23 @@ def load_robot(robot: str | Path) -> RobotDescription:
     Raises:
         DescriptionError: no such robot, or the file is not valid.
     """
+    return parsed_file(robot_path(robot), parse_robot)
+
+
+def robot_path(robot: str | Path) -> Path:
+    """Return the path of a description that is given as one, or as the name of a shipped robot.
+
+    Raises:
+        DescriptionError: neither a path of a YAML file nor such a name.
+    """
     path = Path(robot)
-    if path.suffix not in (".yaml", ".yml"):
-        names = shipped_robots()
-        if str(robot) not in names:
-            near = nearest_name(str(robot), names)
-            raise DescriptionError("robot", str(robot), f"neither a .yaml file nor a shipped robot; {near}")
-        path = robots_directory() / f"{robot}.yaml"
-    return parsed_file(path, parse_robot)
+    if path.suffix in (".yaml", ".yml"):
+        return path
+    names = shipped_robots()
+    if str(robot) not in names:
+        near = nearest_name(str(robot), names)
+        raise DescriptionError("robot", str(robot), f"neither a .yaml file nor a shipped robot; {near}")
+    return robots_directory() / f"{robot}.yaml"
 
 
 def robot_to_mapping(robot: RobotDescription) -> dict[str, Any]:

@@ -220,6 +220,13 @@ def test_an_empty_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["nothing", "silent"]
 
 
+def test_a_misspelt_robot_is_told_by_its_name(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["analyze", str(recorded), "--robot", "thesi", "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    message = capsys.readouterr().err
+    assert "'thesi'" in message and "did you mean 'thesis'?" in message and message.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_recording_of_another_robot_is_refused(drive: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the names of its joints."""
     drive.names = [f"arm_{k}" for k in range(len(drive.names))]

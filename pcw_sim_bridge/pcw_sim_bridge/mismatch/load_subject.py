@@ -7,7 +7,7 @@ from pathlib import Path
 from pcw_description.axis_recording import FORMAT as AXIS_FORMAT
 from pcw_description.description_fields import load_yaml_mapping
 from pcw_description.robot_description import FORMAT as ROBOT_FORMAT
-from pcw_description.robot_file import robots_directory, shipped_robots
+from pcw_description.robot_file import robot_path, shipped_robots
 
 from .axis_subject import AxisSubject
 from .errors import MismatchError
@@ -25,8 +25,8 @@ def load_subject(description: str) -> Subject:
         PcwError: no such file, or it is not valid.
     """
     path = Path(description)
-    if path.suffix not in (".yaml", ".yml") and description in shipped_robots():
-        path = robots_directory() / f"{description}.yaml"
+    if description in shipped_robots() or not path.is_file():
+        path = robot_path(description)
     found = load_yaml_mapping(path).get("format")
     if found == AXIS_FORMAT:
         return AxisSubject.load(path)
