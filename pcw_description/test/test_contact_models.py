@@ -22,6 +22,7 @@ from pcw_description.contact.contact_model import (
     scrub_torque,
     tyre_parameters,
     tyre_step,
+    with_friction,
 )
 from pcw_description.robot_description import CONTACT_MODELS, ContactDescription, LateralContact
 from pcw_description.wheel_dynamics import lateral_force_from_statics, slip_ratio, wheel_acceleration
@@ -44,6 +45,18 @@ def longitudinal(tyre: np.ndarray, slips) -> np.ndarray:
 def lateral(tyre: np.ndarray, slips) -> np.ndarray:
     """Return mu for pure lateral slips."""
     return np.array([friction_coefficient(tyre, 0.0, slip)[1] for slip in slips])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_more_friction_stretches_a_curve_and_is_no_stiffer(model: str) -> None:
+    """Three tenths more of it, reached at three tenths more slip, in both directions; under small forces nothing changes."""
+    tyre = tyre_parameters(contact(model))
+    [stretched] = with_friction(tyre[None], 1.3)
+    for curve in (longitudinal, lateral):
+        np.testing.assert_allclose(curve(stretched, [1e-5]), curve(tyre, [1e-5]), rtol=1e-3)
+        if model in PEAKED:
+            slips = np.linspace(0.0, 0.25, 20)
+            np.testing.assert_allclose(curve(stretched, 1.3 * slips), 1.3 * curve(tyre, slips), rtol=1e-12)
 
 
 def steady_friction(

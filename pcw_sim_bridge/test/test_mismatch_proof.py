@@ -1,6 +1,7 @@
 """The proof: windows of simulation, held-out manoeuvres, intervals, harm, and effects that do not help."""
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -157,6 +158,7 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
             f"caster_offset.x/{caster.name}": -1e-3,
             "module.mass": 1.1 * THESIS.casters[0].module.mass,
             "contact.stiffness": 1.2,
+            "contact.mu_p": 0.9,
             "torque_lag": 1e-3,
         },
     )
@@ -165,7 +167,10 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
     assert robot.casters[1].wheel_radius == 0.0751
     assert robot.casters[1].caster_offset[0] == pytest.approx(caster.caster_offset[0] - 1e-3)
     assert robot.casters[3].module.mass == pytest.approx(1.1 * THESIS.casters[3].module.mass)
-    assert [tyre.lambda_p for tyre in robot.tyres] == pytest.approx([1.2 * tyre.lambda_p for tyre in THESIS.tyres])
+    # A tyre that gives way as before under small forces, times 1.2, and has less friction.
+    assert [tyre.lambda_p for tyre in robot.tyres] == pytest.approx([0.9 * 1.2 * tyre.lambda_p for tyre in THESIS.tyres])
+    assert [tyre.mu_p for tyre in robot.tyres] == pytest.approx([0.9 * tyre.mu_p for tyre in THESIS.tyres])
+    assert [tyre.lateral.mu_p for tyre in robot.tyres] == pytest.approx([0.9 * tyre.lateral.mu_p for tyre in THESIS.tyres])
     assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
 
 
@@ -305,12 +310,32 @@ def test_an_effect_misleads_simulations_by_all_horizons_and_not_by_one(with_it: 
     )
     windows = Windows(("speed",), np.zeros(60, dtype=np.int64), 2.0 * np.arange(60), np.ones_like(spread), (((0, 1.0),),), ())
     prover = SimpleNamespace(
-        before=nominal, rng=rng, _quiet_windows=lambda explanation: windows,
+        before=nominal, rng=rng, tuned=False, _quiet_windows=lambda explanation: windows,
         _simulation_tells=lambda explanation, instance: True, _rollout=lambda explanation, held_out, index: without,
     )
+    prover._harms = functools.partial(Prover._harms, prover)
     held_out = SimpleNamespace(proposed=(0,), instances=(Instance(0, (), (0,)),))
     found = Prover._misleading(prover, SimpleNamespace(), held_out, after)  # type: ignore[arg-type]
     assert (found is not None) == misleads
+
+
+@pytest.mark.parametrize(("alone", "misleads"), [(0.5, False), (1.2, True)])
+def test_an_effect_is_not_blamed_for_the_numbers_beside_it(alone: float, misleads: bool) -> None:
+    """With an offset of 5 mm that was there the simulation followed better, but not with the numbers re-tuned beside it."""
+    rng = np.random.default_rng(0)
+    spread = rng.uniform(0.9, 1.1, size=(60, len(HORIZONS), 1))
+    windows = Windows(("speed",), np.zeros(60, dtype=np.int64), 2.0 * np.arange(60), np.ones_like(spread), (((0, 1.0),),), ())
+    prover = SimpleNamespace(
+        before=spread, rng=rng, tuned=True, _quiet_windows=lambda explanation: windows,
+        _simulation_tells=lambda explanation, instance: True,
+    )
+    errors = {(True, True): 1.3, (True, False): 0.8, (False, True): alone, (False, False): 1.0}
+    prover._rollout = lambda explanation, held_out, without=None: spread * errors[prover.tuned, without is None] ** 2
+    prover._harms = functools.partial(Prover._harms, prover)
+    held_out = SimpleNamespace(proposed=(0,), instances=(Instance(0, (), (0,)),))
+    found = Prover._misleading(prover, SimpleNamespace(), held_out, spread * 1.3**2)  # type: ignore[arg-type]
+    assert (found is not None) == misleads
+    assert prover.tuned
 
 
 @pytest.mark.parametrize(("size", "stays"), [(0.5, True), (1.0, True), (2.2, False)])

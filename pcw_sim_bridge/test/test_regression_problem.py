@@ -97,6 +97,38 @@ def test_an_effect_out_of_proportion_comes_out_with_its_size():
     assert channel_deviations(search.residual_of(instances), search.problem.valid) == pytest.approx([NOISE], rel=0.1)
 
 
+def test_what_a_first_order_promises_is_not_what_is_reached():
+    """At the description its column fits to the noise, at five times the size that belongs to it. No step from there leaves so
+    little, but each leaves a hundredth of what was there, and from the best of them the true size is found.
+    """
+    time = np.arange(SAMPLES) / RATE
+    works, bends = np.sin(2.1 * time), 0.1 * np.cos(3.7 * time)
+
+    def model(x: float) -> np.ndarray:
+        return (x * works + x**2 * bends)[:, None]
+
+    measured = model(1.0) + NOISE * np.random.default_rng(3).standard_normal((SAMPLES, 1))
+
+    def exact(changes, sizes):
+        return measured - model(sum(float(s.coefficients[0]) for s in sizes)), []
+
+    problem = one_channel(
+        measured[:, 0], measured[:, 0],
+        nuisances=(Nuisance("number", "1", 0.0, 1e-3, np.cos(0.3 * time)[:, None]),),
+        terms=(
+            Term(
+                "bent", ("axis",), (LinearParameter("size", "1", 0.0, 100.0, 3.0),), ({},),
+                lambda shape: 0.2 * (works + bends)[:, None, None], is_exact=True, is_curved=True,
+            ),
+        ),
+        exact=exact,
+    )  # fmt: skip
+    search = EffectSearch(problem, np.random.default_rng(0))
+    instances = search.made_exact((Instance(0, (), (0,)),))
+    fit = search.whiten_at(search.residual_of(instances)).fit(instances)
+    assert fit.mean[1] == pytest.approx(1.0, rel=0.01)
+
+
 def test_a_secant_is_exact_with_the_effect_and_without_it():
     """With the coefficient it was taken at, and with none, the residual is that of the model."""
     problem = curved_problem(2.0, 0.0)
@@ -192,6 +224,18 @@ def test_what_a_tolerance_holds_is_no_effect_however_curved(angle, named):
     assert channel_deviations(search.residual_of(found.fit.instances), search.problem.valid) == pytest.approx(
         [0.1 * NOISE], rel=0.1
     )
+
+
+@pytest.mark.parametrize(("angle", "named"), [(0.3, False), (0.7, True), (1.2, True)])
+def test_what_a_part_of_a_tolerance_has_no_room_for_may_be_retuned_by_the_whole(angle, named):
+    """Where three wheels were turned by 200 mrad, the tolerances of 20 were narrowed: -27 of one became an effect."""
+    narrow = turned_problem(angle, 0.2).narrowed({"zero": 0.1})
+    search = EffectSearch(narrow, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.retuned_away(search.conclude(search.made_exact((Instance(0, (), (0,)),)), 5.0))
+    assert selection.fit.instances
+    found = search.with_whole_tolerances(selection, ["zero"])
+    assert bool(found.fit.instances) == named
+    assert (search.problem.nuisances[0].narrowed == 1.0) != named
 
 
 def test_a_shape_that_is_tried_has_the_evidence_of_its_fit():

@@ -185,6 +185,25 @@ def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, ch
         assert off <= most * size, problem.channels[channel].name
 
 
+def test_slips_lag_as_torques_do(tmp_path: Path) -> None:
+    """All torques told a cycle later: what that does is the column of their lag, in the slips of the wheels, too."""
+    recording = record(tmp_path, THESIS, 8)
+    later = copy.copy(recording)
+    joints, commands = recording.joint_states, recording.joint_commands
+    assert joints.effort is not None and commands is not None and commands.effort is not None
+    later.joint_states = dataclasses.replace(joints, effort=np.concatenate([joints.effort[:1], joints.effort[:-1]]))
+    later.joint_commands = dataclasses.replace(commands, effort=np.concatenate([commands.effort[:1], commands.effort[:-1]]))
+    cycle = float(np.median(np.diff(joints.stamp)))
+    before, after = (RobotProblemBuilder(THESIS, [one]).build(with_terms=False) for one in (recording, later))
+    [column] = [nuisance.column for nuisance in before.nuisances if nuisance.name == "torque_lag"]
+    both = before.valid.all(axis=1) & after.valid.all(axis=1)
+    for channel in range(3, 11):
+        change = (after.residual - before.residual)[both, channel]
+        told = cycle * column[both, channel]
+        assert np.linalg.norm(change) > 0.0
+        assert np.linalg.norm(change - told) < 0.1 * np.linalg.norm(change), before.channels[channel].name
+
+
 @pytest.mark.parametrize("plant", ["reduced", "pybullet"])
 def test_an_effect_is_its_own_column(tmp_path: Path, plant: str) -> None:
     """Coulomb friction on one drive: its column gives the torque within 5 %, those of the other drives explain less."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.analysis import analyse
+from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_effects import _flank, _lagging
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST
+from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST, _TermMaker
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS, DYROS = load_robot("thesis"), load_robot("dyros_pcv")
@@ -145,6 +147,33 @@ def test_noise_of_reported_torques_scales_nothing(tmp_path: Path) -> None:
         print(f"{effect.statement} {estimate.value:.4g} ({estimate.low:.4g} to {estimate.high:.4g})")
         assert list(effect.target) == entry["target"] and str(entry.get("axis", "drive")) in effect.statement
         assert estimate.low < float(str(entry[name])) < estimate.high
+
+
+def test_more_friction_is_no_more_scrub(tmp_path: Path) -> None:
+    """Scrub is of friction times a radius: with tyres that have a fifth more of it the radius came out a tenth too large."""
+    robot = load_robot("tidybot2")
+    radius = 1.3e-3
+    concealed = [{"name": "scrub_torque", "target": [*robot.caster_names], "radius": radius}]
+    tyres = with_deviations(robot, {"contact.mu_p": 0.2, "contact.stiffness": -0.4})
+    true_robot = dataclasses.replace(tyres, physics=read_physics(concealed, robot.caster_names))
+    excitation = make_excitation("random_goals", robot, 40.0, 3)
+    record_run(true_robot, excitation.twist, excitation.duration, 3, tmp_path / "run", "reduced", controlled_as=robot)
+    findings = analyse(RobotSubject(robot), [tmp_path / "run"], [], {}, 0, lambda message: None).findings
+    assert [(effect.name, effect.target) for effect in findings.effects] == [("scrub_torque", robot.caster_names)]
+    estimate = findings.effects[0].parameters["radius"]
+    print(f"{estimate.value:.5g} ({estimate.low:.5g} to {estimate.high:.5g})")
+    assert estimate.low < radius < estimate.high
+    assert estimate.value == pytest.approx(radius, rel=0.05)
+
+
+def test_an_error_once_per_turn_is_tried_on_all_encoders_if_one_of_them_turns_enough() -> None:
+    """The same error on four was not tried, because one of them had turned by 3 rad: nothing was named."""
+    reached = np.array([4.0, 5.0, 3.5, 3.0])
+    position = np.zeros((50, 4, 2))
+    position[:, :, 1] = np.linspace(0.0, 1.0, 50)[:, None] * reached
+    maker = SimpleNamespace(robot=THESIS, differences=SimpleNamespace(motions=[SimpleNamespace(position=position)]))
+    for names, turns in ((THESIS.caster_names, True), (THESIS.caster_names[:1], True), (THESIS.caster_names[3:], False)):
+        assert _TermMaker._turns(maker, names, "steer") == turns  # type: ignore[arg-type]
 
 
 def test_play_lies_where_it_lay_while_next_to_no_torque_passes():

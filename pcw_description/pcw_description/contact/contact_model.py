@@ -26,6 +26,9 @@ _KIENCKE, _MAGIC_FORMULA, _DUGOFF, _BURCKHARDT, _LUGRE = range(len(MODELS))
 MODEL, MU, LAMBDA, A, B, C, LATERAL_MU, LATERAL_LAMBDA, LATERAL_A, LATERAL_B, LATERAL_C, LENGTH, SCRUB = range(13)
 TYRE_SIZE = 13
 
+# What the further numbers of a curve are times a factor that stretches it along friction and slip, as powers of that factor.
+_STRETCHED = {_MAGIC_FORMULA: (-1.0, 0.0, 0.0), _BURCKHARDT: (1.0, -1.0, 0.0)}
+
 # Damping of the bristles at standstill [s]; see the module's docstring. A fifth of critical for a 20 kg wheel load.
 DAMPING_TIME = 0.002
 # The inverse of a friction curve stops at this part of its peak; so many steps of the secant bring it there to a percent,
@@ -51,6 +54,20 @@ def tyre_parameters(contact: ContactDescription) -> FloatArray:
     tyre[[LATERAL_A, LATERAL_B, LATERAL_C]] = module.shape_numbers(lateral.mu_p, lateral.lambda_p, contact.shape)
     tyre[LENGTH], tyre[SCRUB] = contact.relaxation_length, contact.scrub_radius
     return tyre
+
+
+def with_friction(tyres: FloatArray, factor: float) -> FloatArray:
+    """Return tyres (n, TYRE_SIZE) whose friction is so many times as large, and reached at so many times the slip.
+
+    What they give way under small forces stays: friction and stiffness are then numbers on their own.
+    """
+    stretched = tyres.copy()
+    stretched[:, [MU, LAMBDA, LATERAL_MU, LATERAL_LAMBDA]] *= factor
+    for model, powers in _STRETCHED.items():
+        rows = stretched[:, MODEL] == model
+        for first in (A, LATERAL_A):
+            stretched[rows, first : first + 3] *= factor ** np.array(powers)
+    return stretched
 
 
 @compiled

@@ -26,7 +26,7 @@ from .effect_gates import EffectGates
 from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
 from .noise_model import SLOW_ORDINATES
 from .outline_search import Outlines, has_outline, searched_outline
-from .regression_problem import FloatArray, RegressionProblem, segment_slices
+from .regression_problem import HEALTHY, FloatArray, RegressionProblem, segment_slices
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep, Progress, SetGrowth
 from .shape_search import refined_shape
@@ -160,6 +160,21 @@ class EffectSearch(SetGrowth):
                 self._exact_at(instead)
                 regression = self.whiten_beside(others)
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
+        return selection
+
+    def with_whole_tolerances(self, selection: Selection, names: Sequence[str]) -> Selection:
+        """The selection without effects that some numbers have room for once their tolerances are whole again.
+
+        With a part of its tolerance alone a number that is off by no more than a healthy robot's passes for an effect, too.
+        """
+        firm = self.problem, self._point
+        self.problem = self.problem.narrowed(dict.fromkeys(names, 1.0))
+        whole = self.retuned_away(self.conclude(self.made_exact(selection.fit.instances), selection.threshold))
+        numbers = zip(self.problem.nuisances, whole.fit.mean, strict=False)
+        healthy = all(abs(float(mean)) < HEALTHY * n.deviation for n, mean in numbers if n.name in names)
+        if healthy and len(whole.fit.instances) < len(selection.fit.instances):
+            return whole
+        self.problem, self._point = firm
         return selection
 
     def bounded(self, selection: Selection) -> Selection:

@@ -103,7 +103,7 @@ class ExactProblem:
             residual, cost = self._left_and_cost(instances)
             fit = self.whiten_beside(instances).fit(instances)
             allowed = GROWTH * self._error(residual, residual) + 2.0 * cost
-            before = self.problem, self._point
+            before, tried = (self.problem, self._point), []
             for part in STEPS:
                 if not self._exact_at(fit, part):
                     if self.problem.point is None or self.problem.point.derived:
@@ -113,14 +113,28 @@ class ExactProblem:
                     break
                 again = instances if reshapings == RESHAPINGS else self._reshaped(instances, residual, reshapings == 0)
                 left, cost = self._left_and_cost(again)
-                if self._error(left, residual) + 2.0 * cost <= allowed:
+                tried.append((self._error(left, residual) + 2.0 * cost, (self.problem, self._point), again))
+                if tried[-1][0] <= allowed:
                     break
                 self.problem, self._point = before
             else:
-                return instances
+                # What was promised is not reached. What is reached may be much all the same, and the rest of it nearer.
+                least, there, again = min(tried, key=lambda step: step[0])
+                if least >= self._error(self._left_here(), residual):
+                    return instances
+                self.problem, self._point = there
             reshapings = RESHAPINGS if again == instances else reshapings + 1
             instances = again
         return instances
+
+    def _left_here(self) -> FloatArray:
+        """Residual (T, C) with all numbers and effects as they are where the problem is exact."""
+        problem, known = self.problem, self._point or {}
+        left = problem.residual - problem.nuisance_columns() @ np.array([known.get(n.name, 0.0) for n in problem.nuisances])
+        for key, size in known.items():
+            if isinstance(key, tuple):
+                left = left - problem.columns(key[0], key[1])[..., key[2]] * size
+        return left
 
     def _reshaped(self, instances: tuple[Instance, ...], residual: FloatArray, coarse: bool) -> tuple[Instance, ...]:
         """Search the shapes again, near where they are; coarse: of what is at work once also as far as its neighbours."""

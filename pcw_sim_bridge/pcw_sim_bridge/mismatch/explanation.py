@@ -233,7 +233,9 @@ def search_effects(
     progress(f"strains left {relief:.2f} of them, {gain:.1f} nats more")
     fewer = len(instead.fit.instances) < len(selection.fit.instances)
     wanted = -again.settings.least_peculiar if fewer else instead.threshold
-    return (again, instead) if relief < RELIEF and gain > wanted else (search, selection)
+    if relief >= RELIEF or gain <= wanted:
+        return search, selection
+    return again, again.with_whole_tolerances(instead, list(strained))
 
 
 def _strains(problem: RegressionProblem, fit: Fit) -> dict[str, float]:

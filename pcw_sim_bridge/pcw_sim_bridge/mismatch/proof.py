@@ -266,14 +266,28 @@ class Prover:
     def _misleading(
         self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None
     ) -> tuple[int, str] | None:
-        """An effect with which the simulation follows less well than with the others and the numbers re-tuned to them."""
+        """An effect with which the simulation follows less well than without, the numbers re-tuned to either or left alone.
+
+        Numbers that are re-tuned beside an effect may lead a simulation astray that the effect alone does not.
+        """
+        harms = self._harms(explanation, held_out, after)
+        if self.tuned and max(harms.values(), default=0.0) > 0.0:
+            self.tuned = False
+            alone = self._harms(explanation, held_out, self._rollout(explanation, held_out))
+            self.tuned = True
+            harms = {index: min(harm, alone.get(index, harm)) for index, harm in harms.items()}
+        index = max(harms, key=lambda k: harms[k], default=0)
+        return (index, "the simulation follows less well with it") if harms.get(index, 0.0) > 0.0 else None
+
+    def _harms(self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None) -> dict[int, float]:
+        """By how much less well, for sure, the simulation follows with each effect that it can tell of; above 0: worse."""
         windows = self._quiet_windows(explanation)
         moving = [k for k in held_out.proposed if self._simulation_tells(explanation, held_out.instances[k])]
         if windows is None or self.before is None or after is None or not moving:
-            return None
+            return {}
 
         # One horizon alone may be met by chance: what errors of two kinds cancel after half a second they do not after two.
-        harms, everywhere = [], range(len(HORIZONS))
+        harms, everywhere = {}, range(len(HORIZONS))
         for index in moving:
             without = self._rollout(explanation, held_out, index)
             assert without is not None
@@ -286,10 +300,9 @@ class Prover:
             nominal = np.where(away[:, None, None], np.nan, self.before)
             described = _rollout_errors(windows, nominal, nominal, self.rng, everywhere).pooled()
             added = float(errors.after[0] - errors.before[0])
-            if added > TELLING_PART**2 * float(described.before[0]):
-                harms.append((float(errors.worse()[0]), index))
-        worst, index = max(harms, default=(0.0, 0))
-        return (index, "the simulation follows less well with it") if worst > 0.0 else None
+            telling = added > TELLING_PART**2 * float(described.before[0])
+            harms[index] = float(errors.worse()[0]) if telling else 0.0
+        return harms
 
     def _no_better(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
         """The effect that helps least, where the description alone is followed better than with all of them.

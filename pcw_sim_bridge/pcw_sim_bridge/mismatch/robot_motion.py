@@ -43,8 +43,8 @@ class RobotMotion:
     Attributes:
         rate: [Hz]; cutoff: of the wide filter [Hz].
         sampling: interval of joint_states [s].
-        position, velocity, acceleration, torque, torque_rate: joints (T, n, 2).
-        quiet_torque: the torque without the noise of its measurement, where that can be had (T, n, 2).
+        position, velocity, acceleration, torque: joints (T, n, 2).
+        quiet_torque: the torque without the noise of its measurement, where that can be had (T, n, 2); torque_rate: its rate.
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
@@ -60,8 +60,8 @@ class RobotMotion:
     velocity: FloatArray
     acceleration: FloatArray
     torque: FloatArray
-    torque_rate: FloatArray
     quiet_torque: FloatArray
+    torque_rate: FloatArray
     imu: FloatArray
     pose: FloatArray
     tracked_twist: FloatArray
@@ -109,6 +109,7 @@ def read_motions(
             position = smooth[:, : 2 * n].reshape(-1, n, 2)
             velocity = derivative(position, rate)
             torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
+            quiet = smooth[:, 4 * n + 6 : 6 * n + 6].reshape(-1, n, 2)
             keep = slice(None, None, step)
             others = slice(4 * n, 4 * n + 6)
             sensed = np.where(np.isfinite(block[:, others]), smooth[:, others], np.nan)
@@ -128,8 +129,8 @@ def read_motions(
                     velocity=velocity[keep].copy(),
                     acceleration=derivative(velocity, rate)[keep].copy(),
                     torque=torque[keep].copy(),
-                    torque_rate=derivative(torque, rate)[keep].copy(),
-                    quiet_torque=smooth[keep, 4 * n + 6 : 6 * n + 6].reshape(-1, n, 2),
+                    quiet_torque=quiet[keep].copy(),
+                    torque_rate=derivative(quiet, rate)[keep].copy(),
                     imu=sensed[keep, :3],
                     pose=base_pose(robot, pose[keep]),
                     tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),

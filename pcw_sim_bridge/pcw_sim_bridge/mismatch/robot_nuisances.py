@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from pcw_description.contact.contact_model import LENGTH
+from pcw_description.contact.contact_model import LENGTH, with_friction
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
 from .all_cores import on_all_cores
@@ -157,6 +157,11 @@ def _radius(index: int) -> Vary:
     return vary
 
 
+def _friction(numbers: ModelNumbers, step: float) -> None:
+    """Vary the friction of all tyres, relative, and not what they give way under small forces: that is another number."""
+    numbers.tyres = with_friction(numbers.tyres, 1.0 + step)
+
+
 def _gain(index: int, axis: int) -> Vary:
     """Vary a torque constant against the mean of all.
 
@@ -246,6 +251,7 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
 
 def _tyres(robot: RobotDescription) -> Iterator[Deviation]:
     yield "contact.stiffness", "contact.stiffness", 1.0, _entry("softness")
+    yield "contact.mu_p", "contact.mu_p", 1.0, _friction
     length = robot.contact.relaxation_length
 
     def relaxation(numbers: ModelNumbers, step: float) -> None:

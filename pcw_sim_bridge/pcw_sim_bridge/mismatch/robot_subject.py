@@ -302,17 +302,24 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
     """Return the robot with tyres that give more or less, each by what all share and by its own."""
     if not any(name.startswith("contact.") for name in retuned):
         return robot
-    common = retuned.get("contact.stiffness", 1.0)
+    common, friction = retuned.get("contact.stiffness", 1.0), retuned.get("contact.mu_p", 1.0)
     length = retuned.get("contact.relaxation_length")
 
     def tyre(caster: str, old: ContactDescription) -> ContactDescription:
         along, across = (
-            max(common + retuned.get(f"contact.stiffness/{caster}_{axis}", 1.0) - 1.0, LEAST_PART) for axis in AXIS_NAMES
+            friction * max(common + retuned.get(f"contact.stiffness/{caster}_{axis}", 1.0) - 1.0, LEAST_PART)
+            for axis in AXIS_NAMES
         )
-        lateral = dataclasses.replace(old.lateral, lambda_p=min(old.lateral.lambda_p * across, 1.0))
+        lateral = dataclasses.replace(
+            old.lateral, mu_p=friction * old.lateral.mu_p, lambda_p=min(old.lateral.lambda_p * across, 1.0)
+        )
         relaxation = old.relaxation_length if length is None else _positive(length, old.relaxation_length)
         return dataclasses.replace(
-            old, lambda_p=min(old.lambda_p * along, 1.0), lateral=lateral, relaxation_length=min(relaxation, 1.0)
+            old,
+            mu_p=friction * old.mu_p,
+            lambda_p=min(old.lambda_p * along, 1.0),
+            lateral=lateral,
+            relaxation_length=min(relaxation, 1.0),
         )
 
     for name in robot.caster_names:

@@ -326,10 +326,10 @@ class _TermMaker:
         return any(p.is_direction for p in effect.parameters if p not in searched) and not _look_of(effect)
 
     def _turns(self, target: Sequence[str], axis: str) -> bool:
-        """Whether joints turn far enough to tell what swings once per turn from a zero and a scale."""
+        """Whether one of these joints turns far enough to tell what swings once per turn from a zero and a scale."""
         joints = [(self.robot.caster_index(name), AXIS_NAMES.index(axis)) for name in target]
         angles = np.concatenate([np.stack([m.position[:, i, k] for i, k in joints]) for m in self.differences.motions], axis=1)
-        return bool(np.ptp(angles, axis=1).min() > HALF_A_TURN)
+        return bool(np.ptp(angles, axis=1).max() > HALF_A_TURN)
 
     def _neutral(self, parameter: EffectParameter) -> float:
         """Value at which the parameter changes nothing."""

@@ -713,7 +713,7 @@ def rolling_state(
         # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads
         # of tyres, would be found as small, or as large, as makes that noise least.
         added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
-        added += (numbers.gain - 1.0) * motion.quiet_torque
+        added += (numbers.gain - 1.0) * motion.quiet_torque + numbers.torque_lag * motion.torque_rate
         if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
             added[:, :, DRIVE] += radius * around.climb[:, :, 0]
         load, force = (
@@ -721,7 +721,7 @@ def rolling_state(
                 numbers.modules, numbers.steer_axis, offset, radius, direction, velocity, motion.acceleration, torque + added,
                 spin, twist, felt, normal, tilt,
             )
-            for torque in (motion.torque + numbers.torque_lag * motion.torque_rate, motion.quiet_torque)
+            for torque in (motion.torque, motion.quiet_torque)
         )  # fmt: skip
         if around.climb is not None:
             force = force - around.climb
