@@ -185,6 +185,17 @@ def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, ch
         assert off <= most * size, problem.channels[channel].name
 
 
+def test_scales_of_an_imu_are_numbers_too(tmp_path: Path) -> None:
+    """Accelerometers half a percent off were parts of a gyroscope's error, with intervals as if nobody allowed them any."""
+    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 9)]).build()
+    numbers = {nuisance.name: nuisance for nuisance in problem.nuisances}
+    [term] = [term for term in problem.terms if term.effect == "imu_scale"]
+    for k, name in enumerate(("imu.gyro_scale", "imu.accelerometer_scale.x", "imu.accelerometer_scale.y")):
+        assert numbers[name].deviation == THESIS.tolerance("imu.scale").value
+        effect, number = term.columns(term.shapes[0])[:, :, k], numbers[name].column
+        assert np.linalg.norm(effect - number) < 0.05 * np.linalg.norm(effect)
+
+
 def test_slips_lag_as_torques_do(tmp_path: Path) -> None:
     """All torques told a cycle later: what that does is the column of their lag, in the slips of the wheels, too."""
     recording = record(tmp_path, THESIS, 8)

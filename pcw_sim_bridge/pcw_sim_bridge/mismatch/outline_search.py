@@ -2,7 +2,8 @@
 
 A few wheels cross a patch here and there. From the place that a first look finds an outline is led to the next one that
 fits there, and a disc never becomes the turned rectangle that fits better: the way from one to the other leads through what
-fits worse. So ellipses and rectangles of several directions and sizes are tried, and the best are moved border by border.
+fits worse. So ellipses and rectangles of several directions and sizes are tried, the best are moved border by border, and
+those that differ most of what is then good are followed downhill in all numbers at once.
 
 What was tried on the way says also how well the outline is known: every one that fits nearly as well may be the true one.
 """
@@ -24,15 +25,17 @@ from .whitened_regression import Instance, WhitenedRegression
 OUTLINE = ("x", "y", "length", "width", "yaw", "roundness")
 DIRECTIONS = (0.0, math.pi / 6.0, math.pi / 3.0)
 SIDES = (0.6, 0.85, 1.2)  # of the sides of the outline that was found
-# The best of them are moved far, and the best of those are moved more finely.
-STARTS, FINALISTS = 6, 2
+STARTS = 6  # of them are moved
 # Borders are moved by these parts of a side, the direction by twice as many radians, as long as that gains.
-FAR_STEPS, FINE_STEPS = (0.4, 0.2, 0.1), (0.05, 0.025)
+STEPS = (0.4, 0.2, 0.1)
 MOVES = 6
 WORTH = 0.3  # nats
 # So many outlines that are about as good as the best, and so many times others between and beyond them.
 POPULATION, GENERATIONS = 40, 40
 AS_GOOD = 1.0  # nats
+# The best outlines that are so many mean sides apart are followed downhill, from a simplex of this part of a side.
+FINALISTS, APART, SIMPLEX = 4, 0.3, 0.05
+EVALUATIONS, CLOSE_ENOUGH = 500, 0.05  # of a descent: at most, and [nats] to the end
 WORST = 1e12  # instead of an outline that cannot be
 NARROWEST = 0.05  # [m], about a tyre's contact patch
 NEARLY = 3.0  # nats below the best that an outline of an earlier search may have been
@@ -91,10 +94,9 @@ def searched_outline(
         near = before.outlines[before.evidence > before.evidence.max() - NEARLY]
         starts += list(near[:: math.ceil(len(near) / MOST_BEFORE)])
     order = 1 + np.argsort([-value for value in trials.evidence(starts)[1:]])
-    reached = [trials.climb(starts[k], FAR_STEPS) for k in (0, *order[:STARTS])]
-    for _, outline in sorted(reached, key=lambda end: -end[0])[:FINALISTS]:
-        trials.climb(outline, FINE_STEPS)
-    trials.spread([*(outline for _, outline in reached), *(starts[k] for k in order)])
+    reached = [trials.climb(starts[k]) for k in (0, *order[:STARTS])]
+    trials.spread([*reached, *(starts[k] for k in order)])
+    trials.settle()
     return trials.best(), trials.all_tried()
 
 
@@ -123,10 +125,10 @@ class _Tried:
             self._known[key] = value if allowed else -math.inf
         return [self._known[key] for key in keys]
 
-    def climb(self, outline: FloatArray, steps: Sequence[float]) -> tuple[float, FloatArray]:
-        """Move borders, middle and direction of an outline as long as one of these gains; the evidence and where it ends."""
+    def climb(self, outline: FloatArray) -> FloatArray:
+        """Move borders, middle and direction of an outline as long as one of these gains; return where it ends."""
         best = self.evidence([outline])[0]
-        for step in steps:
+        for step in STEPS:
             for _ in range(MOVES):
                 moved = [_allowed(outline + part * step * way) for way in _ways(outline) for part in (-1.0, -0.5, 0.5, 1.0)]
                 evidence = self.evidence(moved)
@@ -136,7 +138,7 @@ class _Tried:
                     outline, best = moved[k], evidence[k]
                 if not gain > WORTH:
                     break
-        return best, outline
+        return outline
 
     def spread(self, others: Sequence[FloatArray]) -> None:
         """Go on along all that is about as good as the best: differences between outlines lead from one to the next.
@@ -162,6 +164,29 @@ class _Tried:
             maxiter=GENERATIONS, mutation=(0.3, 1.9), recombination=0.9, tol=0.0, polish=False, seed=0,
             vectorized=True, updating="deferred",
         )  # fmt: skip
+
+    def settle(self) -> None:
+        """Follow the best outlines that differ to where each fits best.
+
+        A strip of which wheels saw one end may be of any length, if its direction and that end follow: of such ridges there is
+        one for every direction tried, and along each a little is lost to the next.
+        """
+        finalists: list[FloatArray] = []
+        for key in sorted(self._known, key=lambda key: -self._known[key]):
+            outline = np.array(_upright(key))
+            side = 0.5 * float(outline[2] + outline[3])
+            if all(np.abs(outline[:4] - other[:4]).sum() > APART * side for other in finalists):
+                finalists.append(outline)
+            if len(finalists) == FINALISTS:
+                break
+        for outline in finalists:
+            unit = 0.5 * np.array([*[outline[2] + outline[3]] * 4, 2.0, 2.0])
+            simplex = outline / unit + np.vstack([np.zeros(6), SIMPLEX * np.eye(6)])
+            optimize.minimize(
+                lambda parts, unit=unit: -self.evidence([_allowed(parts * unit)])[0], outline / unit, method="Nelder-Mead",
+                options={"initial_simplex": simplex, "maxfev": EVALUATIONS, "xatol": 1e-3, "fatol": CLOSE_ENOUGH,
+                         "adaptive": True},
+            )  # fmt: skip
 
     def best(self) -> Instance:
         """The instance with the smallest of the best outlines: where nobody came there need not be any of it."""
@@ -200,7 +225,7 @@ def _ways(outline: FloatArray) -> list[FloatArray]:
 
 
 def _allowed(outline: FloatArray) -> FloatArray:
-    return np.concatenate([outline[:2], np.maximum(outline[2:4], NARROWEST), outline[4:]])
+    return np.array([*outline[:2], *np.maximum(outline[2:4], NARROWEST), outline[4], np.clip(outline[5], 0.0, 1.0)])
 
 
 def _upright(outline: Sequence[float]) -> tuple[float, ...]:

@@ -267,6 +267,7 @@ def _inertial_sensor() -> Iterator[Deviation]:
     yield "imu.scale", "imu.gyro_scale", 1.0, _entry("gyro_scale")
     yield "imu.gyro_bias", "imu.gyro_bias", 0.0, _entry("gyro_bias")
     for k, axis in enumerate("xy"):
+        yield "imu.scale", f"imu.accelerometer_scale.{axis}", 1.0, _entry("accelerometer_scale", k)
         yield "imu.accelerometer_bias", f"imu.accelerometer_bias.{axis}", 0.0, _entry("accelerometer_bias", k)
         yield "imu.position", f"imu.position.{axis}", 0.0, _entry("imu_position", k)
 

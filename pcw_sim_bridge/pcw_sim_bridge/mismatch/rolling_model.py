@@ -203,7 +203,8 @@ class ModelNumbers:
         steer_axis, caster_offset, radius: geometry (n, 2), (n, 2), (n,).
         steer_zero: error of the measured headings (n,) [rad].
         gain: true over reported motor torque (n, 2).
-        imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2].
+        imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2];
+            accelerometer_scale: (2,).
         axle: fixed axles (k, 3), k of 0 or 1: their middle [m] and heading [rad].
         tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
         tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
@@ -231,6 +232,7 @@ class ModelNumbers:
     gyro_bias: float
     gyro_scale: float
     accelerometer_bias: FloatArray
+    accelerometer_scale: FloatArray
     axle: FloatArray
     tracked: FloatArray
     tyres: FloatArray
@@ -276,6 +278,7 @@ class ModelNumbers:
             gyro_bias=0.0,
             gyro_scale=1.0,
             accelerometer_bias=np.zeros(2),
+            accelerometer_scale=np.ones(2),
             axle=robot.fixed_axle.copy(),
             tracked=tracked_place(robot),
             tyres=np.array([tyre_parameters(tyre) for tyre in (*robot.tyres, *(robot.contact for _ in robot.fixed_axle))]),
@@ -785,9 +788,10 @@ def channel_sides(
         late = numbers.clock[0] * derivative(motion.imu, motion.rate) if numbers.clock[0] else 0.0
         measured.append(motion.imu + late)
         rate = numbers.gyro_scale * omega + numbers.gyro_bias
-        along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x + numbers.accelerometer_bias[0]
-        across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y + numbers.accelerometer_bias[1]
-        sensed = np.stack([rate, along, across], axis=1)
+        along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x
+        across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y
+        felt = numbers.accelerometer_scale * np.stack([along, across], axis=1) + numbers.accelerometer_bias
+        sensed = np.concatenate([rate[:, None], felt], axis=1)
         if numbers.imu_lean.any():
             # A sensor that leans feels a part of its weight.
             leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)

@@ -56,7 +56,8 @@ class TorqueResponse:
         wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
         self._wrench_of_torque = np.einsum("tcnf,tnfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
         self._inertia, self._turning = _inertia_slopes(numbers, motion, state)
-        self._imu_position, self._gyro_scale, self._twist = numbers.imu_position, numbers.gyro_scale, state.twist
+        self._imu_position, self._twist = numbers.imu_position, state.twist
+        self._imu_scale = np.array([numbers.gyro_scale, *numbers.accelerometer_scale])
 
     def apply(self, torque: FloatArray) -> FloatArray:
         """Return what torques (T, n, 2, K) [N m] change in measured minus predicted channels (T, C, K)."""
@@ -78,11 +79,11 @@ class TorqueResponse:
             start = layout.inertial.start
             vx, vy = self._twist[:, 0, None], self._twist[:, 1, None]
             dvx, dvy, domega = twist[:, 0], twist[:, 1], twist[:, 2]
-            found[:, start] = -self._gyro_scale * domega
-            found[:, start + 1] = -(
+            found[:, start] = -self._imu_scale[0] * domega
+            found[:, start + 1] = -self._imu_scale[1] * (
                 twist_dot[:, 0] - omega * dvy - domega * vy - twist_dot[:, 2] * y - 2.0 * omega * domega * x
             )
-            found[:, start + 2] = -(
+            found[:, start + 2] = -self._imu_scale[2] * (
                 twist_dot[:, 1] + omega * dvx + domega * vx + twist_dot[:, 2] * x - 2.0 * omega * domega * y
             )
         if layout.pose:
