@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
+from pcw_description.contact.contact_model import tyre_parameters
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.robot_description import thinnest_module_inertia
@@ -172,6 +173,15 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
     assert [tyre.mu_p for tyre in robot.tyres] == pytest.approx([0.9 * tyre.mu_p for tyre in THESIS.tyres])
     assert [tyre.lateral.mu_p for tyre in robot.tyres] == pytest.approx([0.9 * tyre.lateral.mu_p for tyre in THESIS.tyres])
     assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
+
+
+def test_sliding_friction_is_retuned_with_the_rest_of_it() -> None:
+    """Left alone it would be above the peak, which no tyre has: the analysis would end with the error of the description."""
+    contact = dataclasses.replace(THESIS.contact, model="lugre", shape={"mu_c": 0.9 * THESIS.contact.mu_p})
+    robot = retuned_robot(dataclasses.replace(THESIS, contact=contact), {"contact.mu_p": 0.8})
+    for tyre in robot.tyres:
+        assert tyre.shape["mu_c"] == pytest.approx(0.9 * tyre.mu_p)
+        np.testing.assert_allclose(tyre_parameters(tyre)[[1, 4]], [0.8 * THESIS.contact.mu_p, 0.9])
 
 
 @pytest.fixture(scope="module")

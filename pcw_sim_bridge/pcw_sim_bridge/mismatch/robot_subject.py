@@ -314,10 +314,13 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
             old.lateral, mu_p=friction * old.lateral.mu_p, lambda_p=min(old.lateral.lambda_p * across, 1.0)
         )
         relaxation = old.relaxation_length if length is None else _positive(length, old.relaxation_length)
+        # Of the numbers that shape a curve one is a friction, too.
+        shape = {name: value * friction if name == "mu_c" else value for name, value in old.shape.items()}
         return dataclasses.replace(
             old,
             mu_p=friction * old.mu_p,
             lambda_p=min(old.lambda_p * along, 1.0),
+            shape=shape,
             lateral=lateral,
             relaxation_length=min(relaxation, 1.0),
         )
