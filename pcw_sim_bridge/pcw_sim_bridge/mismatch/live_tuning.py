@@ -133,13 +133,16 @@ class Tuning:
 
     def release(self, numbers: BoolArray) -> None:
         """Give some numbers (K,) their tolerance back; what is known of the others stays as it is."""
-        stay = np.flatnonzero(~numbers)
-        precision = np.linalg.inv(self.covariance[np.ix_(stay, stay)])
-        self.information = np.zeros_like(self.information)
-        self.information[np.ix_(stay, stay)] = precision - np.diag(1.0 / self.layout.deviations[stay] ** 2)
-        moment = precision @ self.mean[stay]
-        self.moment = np.zeros_like(self.moment)
-        self.moment[stay] = moment
+        stay, gone = np.flatnonzero(~numbers), np.flatnonzero(numbers)
+        scale = self.layout.deviations
+        # Integrated over the numbers that go (Schur complement), in units of the tolerances.
+        precision = self.information * np.outer(scale, scale) + np.eye(len(scale))
+        moment = self.moment * scale
+        weights = np.linalg.solve(precision[np.ix_(gone, gone)], precision[np.ix_(gone, stay)])
+        left = precision[np.ix_(stay, stay)] - precision[np.ix_(stay, gone)] @ weights - np.eye(len(stay))
+        self.information, self.moment = np.zeros_like(self.information), np.zeros_like(self.moment)
+        self.information[np.ix_(stay, stay)] = 0.5 * (left + left.T) / np.outer(scale[stay], scale[stay])
+        self.moment[stay] = (moment[stay] - moment[gone] @ weights) / scale[stay]
         self._update()
 
     def beyond_tolerance(self, factor: float = 3.0) -> list[str]:

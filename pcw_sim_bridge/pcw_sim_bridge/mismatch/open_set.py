@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -162,6 +162,21 @@ def shared_beliefs(search: EffectSearch, selection: Selection) -> dict[int, floa
     Which part of a friction is viscous, and which an unknown function of the same speed, no recording can tell.
     """
     problem = search.problem
+    rows = _standard_rows(search, selection)
+    beliefs: dict[int, float] = {}
+    for law in (i for i in selection.fit.instances if is_unknown(problem, i)):
+        arguments, functions = set(problem.terms[law.term].arguments), rows(law)
+        for name in selection.fit.instances:
+            if is_unknown(problem, name) or not arguments <= set(problem.terms[name.term].arguments):
+                continue
+            if _held(rows(name), functions):
+                beliefs[name.term] = SHARED_BELIEF
+    return beliefs
+
+
+def _standard_rows(search: EffectSearch, selection: Selection) -> Callable[[Instance], FloatArray]:
+    """Return what gives an instance's columns (T C, K) in deviations of what the selection leaves of each channel."""
+    problem = search.problem
     residual = search.residual_of(selection.fit.instances)
     pairs = zip(residual.T, problem.valid.T, strict=True)
     deviation = np.array([robust_deviation(left[valid]) if valid.any() else 1.0 for left, valid in pairs])
@@ -171,17 +186,13 @@ def shared_beliefs(search: EffectSearch, selection: Selection) -> dict[int, floa
         columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         return (columns * scale[:, :, None]).reshape(scale.size, -1)
 
-    beliefs: dict[int, float] = {}
-    for law in (i for i in selection.fit.instances if is_unknown(problem, i)):
-        arguments, functions = set(problem.terms[law.term].arguments), rows(law)
-        for name in selection.fit.instances:
-            if is_unknown(problem, name) or not arguments <= set(problem.terms[name.term].arguments):
-                continue
-            own = rows(name)
-            left = own - functions @ np.linalg.lstsq(functions, own, rcond=1e-9)[0]
-            if np.sum(left**2) < (1.0 - HELD_PART) * np.sum(own**2):
-                beliefs[name.term] = SHARED_BELIEF
-    return beliefs
+    return rows
+
+
+def _held(own: FloatArray, functions: FloatArray) -> bool:
+    """Whether functions (N, F) hold columns (N, K) to a part of their square."""
+    left = own - functions @ np.linalg.lstsq(functions, own, rcond=1e-9)[0]
+    return bool(np.sum(left**2) < (1.0 - HELD_PART) * np.sum(own**2))
 
 
 def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> Selection | None:
@@ -245,17 +256,28 @@ def _as_far_as_seen(problem: RegressionProblem, law: Law, form: ClosedForm) -> C
 
 
 def _without_what_names_hold(search: EffectSearch, selection: Selection, law: Law, form: ClosedForm) -> Law:
-    """Return the law without those of its functions that the names beside it do without."""
+    """Return the law without those of its functions that the names beside it do without.
+
+    A function that a name is already goes for a part of what the law explains, too: each against the other, large and
+    opposite, the two mend the shape of the law and say nothing.
+    """
     names, own = selection.fit.instances[:-1], selection.fit.instances[-1]
+    if not names:
+        return law
+    fit, rows = selection.regression.fit, _standard_rows(search, selection)
+    beside = np.concatenate([rows(name) for name in names], axis=1)
+    held = {k for k in own.active if _held(rows(dataclasses.replace(own, active=(k,))), beside)}
+    explained = fit((*names, own)).log_evidence - fit(names).log_evidence
     active = own.active
-    while len(active) > 1 and names:
-        best = selection.regression.fit((*names, dataclasses.replace(own, active=active))).log_evidence
+    while len(active) > 1:
+        best = fit((*names, dataclasses.replace(own, active=active))).log_evidence
         trials = [tuple(k for k in active if k != left) for left in active]
-        evidence = [
-            selection.regression.fit((*names, dataclasses.replace(own, active=trial))).log_evidence for trial in trials
-        ]
-        index = int(np.argmax(evidence))
-        if best - evidence[index] > selection.threshold:
+        margins = []
+        for left, trial in zip(active, trials, strict=True):
+            allowed = max(selection.threshold, CLOSED_PART * explained) if left in held else selection.threshold
+            margins.append(fit((*names, dataclasses.replace(own, active=trial))).log_evidence - best + allowed)
+        index = int(np.argmax(margins))
+        if margins[index] < 0.0:
             break
         active = trials[index]
     return dataclasses.replace(law, basis=dataclasses.replace(form, atoms=tuple(form.atoms[k] for k in active)))
