@@ -95,7 +95,7 @@ def test_a_saved_calibration_judges_from_the_start(learned: Tuning, friction: li
     np.testing.assert_allclose(deviation[place], again.layout.deviations[place], rtol=1e-6)
     np.testing.assert_allclose(again.mean[place], 0.0, atol=1e-12)
     # Against how well a number is known: one that happens to be near zero has no digits of its own.
-    np.testing.assert_allclose(((again.mean - learned.mean) / deviation)[~place], 0.0, atol=1e-6)
+    np.testing.assert_allclose(((again.mean - learned.mean) / deviation)[~place], 0.0, atol=1e-4)
     np.testing.assert_allclose(deviation[~place], np.sqrt(np.diag(learned.covariance))[~place], rtol=1e-5)
     live = LiveChannels(THESIS, PARAMETERS, again)
     early = [m for m in after(friction, 2.0) if m.log_time_ns < 6e9]

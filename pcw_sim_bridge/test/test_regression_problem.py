@@ -407,9 +407,9 @@ def test_what_happens_once_must_stand_above_other_bursts():
 
 
 def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
-    """A size that is another in each block is no better known than its mean is: t of nine degrees holds 92 % of the time."""
+    """A size that is another in each block is no better known than its mean is, and few blocks hardly tell how well that is."""
     held = 0
-    for seed in range(40):
+    for seed in range(400):
         rng = np.random.default_rng(seed)
         time = np.arange(5 * SAMPLES) / RATE
         column = np.sin(2.1 * time)
@@ -419,7 +419,7 @@ def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
         )
         estimate = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))[0].estimates["size"]
         held += estimate.low <= 1.0 <= estimate.high
-    assert 34 <= held <= 40
+    assert 373 <= held <= 389  # 95 % are 380; with a normal distribution of what few blocks say, 371
 
 
 @pytest.mark.parametrize("healthy", [-0.3, -0.1, 0.0, 0.2, 0.35])

@@ -321,14 +321,17 @@ class WhitenedRegression:
         """Covariance (k, k) of a fit's numbers by how the blocks disagree about them, whatever the residual is like.
 
         Where the model is not quite right the residual is no noise, and one block pulls the numbers this way and another that
-        way by more than their own noise would: (A^-1 S A^-1), S the covariance of the sum of the blocks' scores.
+        way by more than their own noise would: (A^-1 S A^-1), S the covariance of the sum of the blocks' scores. How much they
+        disagree few blocks hardly tell: it is that of a normal distribution with intervals as wide as Student's.
         Source: White, Econometrica 48 (1980); with blocks as clusters, Liang and Zeger, Biometrika 73 (1986).
         """
         grams = self.grams(fit.instances)
         scores = grams[:, :-1, -1] - grams[:, :-1, :-1] @ fit.mean
         scores -= scores.mean(axis=0)
         pulled = scores @ fit.covariance
-        covariance: FloatArray = pulled.T @ pulled * (len(grams) / max(len(grams) - 1, 1))
+        freedom = max(len(grams) - 1, 1)
+        wider = float(stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975))
+        covariance: FloatArray = pulled.T @ pulled * (len(grams) / freedom * wider**2)
         return covariance
 
     def log_odds(self, other: Fit, fit: Fit) -> float:
