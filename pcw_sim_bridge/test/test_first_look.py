@@ -167,7 +167,7 @@ def test_a_problem_is_exact_where_it_is_made_so(tmp_path: Path) -> None:
         record_run(true, excitation.twist, 12.0, 3, tmp_path / str(offset), "reduced", controlled_as=THESIS)
         problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / str(offset), THESIS)]).build()
         number = next(k for k, term in enumerate(problem.terms) if term.key == "steer_zero_offset/front_left")
-        exact = problem.exact_at({}, [SizedTerm(number, (), np.array([offset]))])
+        exact = problem.exact_at({}, [SizedTerm(number, (), np.array([offset]), (0,))])
         assert np.array_equal(exact.nominal_residual, problem.residual)
         slip = [k for k, channel in enumerate(problem.channels) if channel.name.startswith("rolling")]
         rows = problem.valid[:, slip].all(axis=1)

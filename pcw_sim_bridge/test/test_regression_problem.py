@@ -132,11 +132,11 @@ def test_what_a_first_order_promises_is_not_what_is_reached():
 def test_a_secant_is_exact_with_the_effect_and_without_it():
     """With the coefficient it was taken at, and with none, the residual is that of the model."""
     problem = curved_problem(2.0, 0.0)
-    there = problem.exact_at({"number": 0.0}, [SizedTerm(0, (), np.array([1.5]))])
+    there = problem.exact_at({"number": 0.0}, [SizedTerm(0, (), np.array([1.5]), (0,))])
     column = there.columns(0, ())[..., 0]
     exact = problem.exact
     assert exact is not None
-    assert there.residual - 1.5 * column == pytest.approx(exact({}, [SizedTerm(0, (), np.array([1.5]))])[0])
+    assert there.residual - 1.5 * column == pytest.approx(exact({}, [SizedTerm(0, (), np.array([1.5]), (0,))])[0])
     assert there.residual == pytest.approx(exact({}, [])[0])
 
 
@@ -407,7 +407,7 @@ def test_what_happens_once_must_stand_above_other_bursts():
 
 
 def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
-    """A size that is another in each block is no better known than its mean is, and few blocks hardly tell how well that is."""
+    """A size that is another in each block is known as well as its mean is, and few blocks hardly tell how well that is."""
     held = 0
     for seed in range(400):
         rng = np.random.default_rng(seed)
@@ -420,6 +420,52 @@ def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
         estimate = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))[0].estimates["size"]
         held += estimate.low <= 1.0 <= estimate.high
     assert 373 <= held <= 389  # 95 % are 380; with a normal distribution of what few blocks say, 371
+
+
+def geared_problem(play: float, twist: float) -> RegressionProblem:
+    """A gear that plays, or twists: its teeth give way by 0.3 of what a soft gear of size one does."""
+    time = np.arange(5 * SAMPLES) / RATE
+    torque = np.sin(2.1 * time)
+    flank = np.sign(torque)
+    measured = play * flank + twist * torque + NOISE * np.random.default_rng(1).standard_normal(len(time))
+    size = LinearParameter("play", "rad", 0.0, 10.0, 1.0)
+    teeth = LinearParameter("tooth_stiffness", "N m/rad", 0.0, 10.0, 1.0, refinement=True, usual=0.3)
+    soft = LinearParameter("stiffness", "N m/rad", 0.0, 10.0, 1.0)
+    terms = (
+        Term("gear_elasticity", ("left",), (soft,), ({},), lambda shape: torque[:, None, None], axis="drive"),
+        Term(
+            "gear_backlash", ("left",), (size, teeth), ({},), lambda shape: np.stack([flank, torque], axis=1)[:, None],
+            axis="drive",
+        ),
+    )  # fmt: skip
+    return one_channel(measured, measured, nuisances=(), terms=terms)
+
+
+@pytest.mark.parametrize(("play", "twist", "alike"), [(0.002, 0.3, True), (0.0, 0.2, False), (0.0, 0.5, False)])
+def test_a_soft_gear_may_be_one_with_a_small_play(play: float, twist: float, alike: bool) -> None:
+    """Its teeth give way more than it plays: softer than they or stiffer, it is no play."""
+    search = EffectSearch(geared_problem(play, twist), np.random.default_rng(0), SelectionSettings(surrogates=20))
+    [named] = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))
+    assert (named.ambiguous_with == ("gear_backlash",)) is alike
+    assert (named.probability < 0.9) is alike
+
+
+def test_a_fit_with_a_known_number_has_the_evidence_of_what_is_left() -> None:
+    """Teeth known to give way by 0.3, and their share taken off what was measured: the same play, and as much evidence."""
+    problem = geared_problem(0.05, 0.3)
+    search = EffectSearch(problem, np.random.default_rng(0))
+    regression = search.whiten_at(problem.residual, white=True)
+    [(rival, fit)] = search.as_usual(regression, (), Instance(0, (), (0,)))
+    rest = problem.residual - 0.3 * problem.columns(1, ())[..., 1]
+    without = regression.moved(dataclasses.replace(problem, residual=rest)).fit((rival,))
+    assert fit.mean == pytest.approx([without.mean[0], 0.3])
+    assert fit.log_evidence == pytest.approx(without.log_evidence, abs=1e-6)
+
+
+def test_a_refinement_that_is_not_looked_at_is_as_it_usually_is() -> None:
+    parameters = geared_problem(0.0, 0.0).terms[1].parameters
+    assert SizedTerm(1, (), np.array([0.05, 0.0]), (0,)).values(parameters) == {"play": 0.05, "tooth_stiffness": 0.3}
+    assert SizedTerm(1, (), np.array([0.05, 0.0]), (0, 1)).values(parameters) == {"play": 0.05, "tooth_stiffness": 0.0}
 
 
 @pytest.mark.parametrize("healthy", [-0.3, -0.1, 0.0, 0.2, 0.35])

@@ -161,7 +161,7 @@ def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, ch
     def sizes(friction: float) -> list[SizedTerm]:
         coefficients = np.zeros(len(problem.terms[index].parameters))
         coefficients[0] = friction
-        return [SizedTerm(index, shape, coefficients)]
+        return [SizedTerm(index, shape, coefficients, (0,))]
 
     here = problem.exact_at(changes, sizes(0.3)).with_soft_tyres().derived()
 
@@ -319,7 +319,7 @@ def test_a_cogging_turns_with_the_wheel_and_not_with_what_is_read_of_it(tmp_path
     true = dataclasses.replace(THESIS, physics=read_physics(entries, THESIS.caster_names))
     problem = RobotProblemBuilder(THESIS, [record(tmp_path, true, 9)]).build()
     place = [term.key for term in problem.terms].index("motor_cogging/steer of rear_left")
-    size = SizedTerm(place, (("order", 34.0),), np.array([0.3, 0.1]))
+    size = SizedTerm(place, (("order", 34.0),), np.array([0.3, 0.1]), (0, 1))
     left = {}
     for zero in (0.0, -0.02):
         assert problem.exact is not None
@@ -358,7 +358,7 @@ def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path) -> None:
     assert problem.exact is not None
     sizes = np.array([40.0 * (parameter.name == "force_x") for parameter in problem.terms[term].parameters])
     left = {}
-    for name, own in (("without", []), ("with", [SizedTerm(term, tuple(shape.items()), sizes)])):
+    for name, own in (("without", []), ("with", [SizedTerm(term, tuple(shape.items()), sizes, tuple(range(len(sizes))))])):
         residual, _ = problem.exact({}, own)
         left[name] = [np.sqrt(np.mean(residual[problem.valid[:, 0] & rows, 0] ** 2)) for rows in (~second, second)]
     assert left["with"][0] == pytest.approx(left["without"][0])

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -278,6 +278,31 @@ class EffectSearch(SetGrowth):
                 found.append(rival)
             if len(found) == MOST_ALIKE or candidate.gain < selection.losses[selection.fit.instances.index(own)] - FAR:
                 break
+        usual = self.as_usual(regression, others, own)
+        found += [rival for rival, fit in usual if fit.log_evidence > selection.fit.log_evidence - ALIKE]
+        return found
+
+    def as_usual(
+        self, regression: WhitenedRegression, others: tuple[Instance, ...], own: Instance
+    ) -> list[tuple[Instance, Fit]]:
+        """What looks like an effect together with what it usually is besides, as it is named, and the fit of both to that.
+
+        Teeth with play give way, too. Of a small play that is nearly all that is seen, and a soft gear does it as well.
+        """
+        terms, known = self.problem.terms, all_effects().get(self.problem.terms[own.term].effect)
+        mine, found = terms[own.term], []
+        for position, term in enumerate(terms if known is not None else ()):
+            assert known is not None
+            usual = {k: p.usual for k, p in enumerate(term.parameters) if p.usual is not None}
+            if not usual or term.effect not in known.look_alikes or (term.target, term.axis) != (mine.target, mine.axis):
+                continue
+            for candidate in regression.scan(others, only=[position])[0][:1]:
+                if self.repeats(candidate.instance, others):
+                    continue
+                whole = dataclasses.replace(candidate.instance, active=tuple(range(len(term.parameters))))
+                fit = _known(regression.fit((*others, whole)), usual, np.array([term.parameters[k].deviation for k in usual]))
+                if regression.within_bounds(fit):
+                    found.append((candidate.instance, fit))
         return found
 
     def with_outlines(self, selection: Selection) -> Selection:
@@ -472,6 +497,21 @@ class EffectSearch(SetGrowth):
             for index, instance in enumerate(chosen)
         ]
         return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), (*self.ladder, *named))
+
+
+def _known(fit: Fit, values: Mapping[int, float], deviations: FloatArray) -> Fit:
+    """Return a fit with some numbers of its last instance known, by position; `deviations` (K,) is what was expected of them.
+
+    Its evidence is larger by how much surer of these values one is with the recordings than before.
+    """
+    first = len(fit.mean) - len(fit.instances[-1].active)
+    rows, there = [first + k for k in values], np.array(list(values.values()))
+    covariance, away = fit.covariance[np.ix_(rows, rows)], there - fit.mean[rows]
+    step = np.linalg.solve(covariance, away)
+    surer = float(np.sum(np.log(deviations)) + 0.5 * np.sum((there / deviations) ** 2))
+    surer -= 0.5 * float(np.linalg.slogdet(covariance)[1] + away @ step)
+    mean = fit.mean + fit.covariance[:, rows] @ step
+    return dataclasses.replace(fit, mean=mean, log_evidence=fit.log_evidence + surer)
 
 
 def _terms(instances: Sequence[Instance]) -> tuple[int, ...]:

@@ -177,7 +177,7 @@ class ExactProblem:
         for instance in fit.instances:
             coefficients = np.zeros(len(terms[instance.term].parameters))
             coefficients[list(instance.active)] = [point[instance.term, instance.shape, k] for k in instance.active]
-            sizes.append(SizedTerm(instance.term, instance.shape, coefficients))
+            sizes.append(SizedTerm(instance.term, instance.shape, coefficients, instance.active))
         self._point = point
         self.problem = problem.exact_at({n.name: point[n.name] for n in problem.nuisances}, sizes)
         return self.problem is not problem

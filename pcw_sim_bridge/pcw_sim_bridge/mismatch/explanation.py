@@ -564,6 +564,10 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
             rivals.append(difference)
             if difference > -AMBIGUOUS:
                 alike.append(problem.terms[refined[position].term].effect)
+    for rival, usual in search.as_usual(regression, others, own):
+        rivals.append(regression.log_odds(usual, fit))
+        if rivals[-1] > -AMBIGUOUS:
+            alike.append(_called(problem.terms[own.term], problem.terms[rival.term]))
     for candidate in regression.scan(others)[0]:
         same = candidate.instance.term == own.term
         if (

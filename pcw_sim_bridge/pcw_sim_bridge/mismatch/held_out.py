@@ -15,7 +15,7 @@ from scipy import optimize
 from .evidence_selection import Selection
 from .manoeuvres import manoeuvres
 from .noise_model import channel_deviations, huber_weights, reliability
-from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProblem
+from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProblem, SizedTerm
 from .whitened_regression import Instance, WhitenedRegression
 
 FOLDS = 4  # parts that manoeuvres are dealt out to in turn
@@ -229,9 +229,11 @@ def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> Re
             continue
         term = problem.terms[size.term]
         place = places[term.key]
-        known = dict(zip((p.name for p in term.parameters), size.coefficients, strict=True))
-        coefficients = np.array([known.get(p.name, 0.0) for p in other.terms[place].parameters])
-        sizes.append(dataclasses.replace(size, term=place, coefficients=coefficients))
+        names, there = [p.name for p in term.parameters], [p.name for p in other.terms[place].parameters]
+        known = dict(zip(names, size.coefficients, strict=True))
+        coefficients = np.array([known.get(name, 0.0) for name in there])
+        active = tuple(there.index(names[k]) for k in size.active if names[k] in there)
+        sizes.append(SizedTerm(place, size.shape, coefficients, active))
     exact = other.exact_at(problem.point.changes, sizes)
     return exact.derived() if problem.point.derived else exact
 

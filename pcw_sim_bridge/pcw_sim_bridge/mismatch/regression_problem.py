@@ -93,6 +93,7 @@ class LinearParameter:
     Attributes:
         lower, upper, deviation: bounds and prior deviation of the coefficient.
         refinement: zero unless there is evidence for it; not part of the effect when it is first named.
+        usual: coefficient that a refinement has where nobody knows better; None where that is zero.
         origin: value of the parameter where the coefficient is zero.
         reciprocal: the coefficient is the inverse of the parameter's distance from `pole`, less that of the origin's;
             squared: it is its square.
@@ -107,6 +108,7 @@ class LinearParameter:
     upper: float
     deviation: float
     refinement: bool = False
+    usual: float | None = None
     origin: float = 0.0
     reciprocal: bool = False
     pole: float = 0.0
@@ -200,11 +202,23 @@ class Term:
 
 @dataclasses.dataclass(frozen=True)
 class SizedTerm:
-    """A term of a problem at work: with a shape, and with coefficients of all its parameters (P,)."""
+    """A term of a problem at work: with a shape, and with coefficients of all its parameters (P,).
+
+    Refinements whose positions are not among the `active` ones are as they usually are.
+    """
 
     term: int
     shape: tuple[tuple[str, float], ...]
     coefficients: FloatArray
+    active: tuple[int, ...]
+
+    def values(self, parameters: Sequence[LinearParameter]) -> dict[str, float]:
+        """Return the values of the term's parameters, by name."""
+        sizes = (
+            float(size) if k in self.active else p.usual or 0.0
+            for k, (p, size) in enumerate(zip(parameters, self.coefficients, strict=True))
+        )
+        return {p.name: p.value(size) for p, size in zip(parameters, sizes, strict=True)}
 
 
 @dataclasses.dataclass(frozen=True)

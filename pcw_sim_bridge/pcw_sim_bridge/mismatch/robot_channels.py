@@ -202,9 +202,7 @@ class RobotProblemBuilder:
         for size in sizes:
             term = terms[size.term]
             if term.is_exact:
-                values = dict(size.shape)
-                for parameter, coefficient in zip(term.parameters, size.coefficients, strict=True):
-                    values[parameter.name] = parameter.value(float(coefficient))
+                values = dict(size.shape) | size.values(term.parameters)
                 instances.append(effect_instance(term.effect, term.target, values, term.axis))
         try:
             described = as_it_really_is(dataclasses.replace(self.robot, physics=(*self.robot.physics, *instances)))

@@ -432,6 +432,7 @@ def _linear(parameter: EffectParameter, neutral: float, room: float) -> LinearPa
             origin=neutral, reciprocal=True, pole=parameter.pole,
             # Of stiffness there may be none to be seen beside what the effect is: at a bound it would rule that out.
             refinement=parameter.default is not None,
+            usual=None if parameter.default is None else 1.0 / (parameter.default - parameter.pole) - there,
         )
     if parameter.squared:
         deviation = max(3.0 * parameter.typical**2, room)

@@ -9,9 +9,11 @@ from pcw_description.robot_description import FloatArray, RobotDescription
 
 # Columns of the constant numbers of a caster.
 SX, SY, BX, BY, RADIUS, MASS, CX, CY, IZZ, I_ROLL, J_RP, J_PP, LIMIT_DRIVE, LIMIT_STEER, TYRE = range(15)
-# Columns of the state of a caster; the last two are the joint accelerations of the last step.
-RHO, PHI, RHO_DOT, PHI_DOT, ZX, ZY, MOTOR_RHO, MOTOR_PHI, SLIP_X, SLIP_Y, FX, FY, FZ, RHO_DDOT, PHI_DDOT = range(15)
-WHEEL_STATE = 15
+# Columns of the state of a caster; the last four are the joint accelerations of the last step and, of plants in space, what
+# pushed the contact besides its tyre [N].
+RHO, PHI, RHO_DOT, PHI_DOT, ZX, ZY, MOTOR_RHO, MOTOR_PHI, SLIP_X, SLIP_Y, FX, FY, FZ = range(13)
+RHO_DDOT, PHI_DDOT, PUSH_X, PUSH_Y = range(13, 17)
+WHEEL_STATE = 17
 
 
 def caster_numbers(robot: RobotDescription) -> FloatArray:

@@ -51,6 +51,8 @@ from .caster_arrays import (
     PHI,
     PHI_DDOT,
     PHI_DOT,
+    PUSH_X,
+    PUSH_Y,
     RADIUS,
     RHO,
     RHO_DDOT,
@@ -64,6 +66,7 @@ from .caster_arrays import (
     ZY,
 )
 from .drivetrain import joint_torques, motor_torques, turn_motors
+from .effect_tables import GEAR, SLOPE
 from .surroundings import chassis_wrench, ground_under
 
 
@@ -105,6 +108,17 @@ def _joint_inertia(caster, along):  # type: ignore[no-untyped-def]
     return caster[I_ROLL] if along == 0 else caster[IZZ] + caster[J_PP]
 
 
+@compiled
+def _behind_gear(dt, mobility, arm, inertia, gear, state):  # type: ignore[no-untyped-def]
+    """The mobility of a contact [1/kg] that a motor behind a gear is carried along with, as far as the gear grips.
+
+    A gear that hardly gives way is none: the motor adds to what a force at an arm [m] turns of an inertia [kg m^2].
+    """
+    if gear[GEAR] == 0.0:
+        return mobility
+    return mobility - arm * arm * (1.0 / inertia - 1.0 / (inertia + dt * state[SLOPE]))
+
+
 def contact_mobility(robot: RobotDescription) -> FloatArray:
     """Return by how much a force along and across each wheel accelerates its slip at most, (n, 2) [1/kg].
 
@@ -124,14 +138,25 @@ def contact_mobility(robot: RobotDescription) -> FloatArray:
 
 
 @compiled
-def _slip_after(dt, mobility, slip, slip_before, force, force_before, stiffness):  # type: ignore[no-untyped-def]
+def _pushes(dt, mobility, change, force_before, push_before, force):  # type: ignore[no-untyped-def]
+    """What pushed a contact besides its tyre in the last step, and what will in this one if it goes on as it went [N].
+
+    Of a wheel that was just put where it is nothing is known, nor how its slip changed: then it slips on as it does.
+    """
+    if math.isnan(push_before):
+        return force, force
+    push = force_before + change / (dt * mobility)
+    return push, 2.0 * push - push_before
+
+
+@compiled
+def _slip_after(dt, mobility, slip, push, force, stiffness):  # type: ignore[no-untyped-def]
     """Slip at the end of a step, in which a stiff tyre under a light wheel has turned back long before its end.
 
-    All that pushes besides the tyre is taken to go on as in the last step, and the tyre to follow its slip to first order. A
-    mobility that is too large damps; one that is too small would let the step swing up.
+    The tyre follows its slip to first order. A mobility that is too large damps; one that is too small would let the step
+    swing up.
     """
-    change = slip - slip_before + dt * mobility * (force_before - force)
-    return slip + change / (1.0 + dt * mobility * stiffness)
+    return slip + dt * mobility * (push - force) / (1.0 + dt * mobility * stiffness)
 
 
 @compiled
@@ -229,13 +254,18 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         tyre = casters[i, TYRE:]
         grip = normal * ground[FRICTION]
         z_x, z_y = slip_under_load(row[ZX], row[FZ], normal), slip_under_load(row[ZY], row[FZ], normal)
+        gear, motor = effects.gears[i], effects.gear_state[i]
+        free_x = _behind_gear(dt, mobility[i, 0], casters[i, RADIUS], _joint_inertia(casters[i], 0), gear[0], motor[0])
+        free_y = _behind_gear(dt, mobility[i, 1], casters[i, BX], _joint_inertia(casters[i], 1), gear[1], motor[1])
         _, _, force_x, force_y, _, _, stiff_x, stiff_y = tyre_step_with_slopes(tyre, z_x, z_y, slip_x, slip_y, speed, grip, dt)
+        row[PUSH_X], push_x = _pushes(dt, free_x, slip_x - row[SLIP_X], row[FX], row[PUSH_X], force_x)
+        row[PUSH_Y], push_y = _pushes(dt, free_y, slip_y - row[SLIP_Y], row[FY], row[PUSH_Y], force_y)
         row[ZX], row[ZY], force_x, force_y = tyre_step(
             tyre,
             z_x,
             z_y,
-            _slip_after(dt, mobility[i, 0], slip_x, row[SLIP_X], force_x, row[FX], stiff_x),
-            _slip_after(dt, mobility[i, 1], slip_y, row[SLIP_Y], force_y, row[FY], stiff_y),
+            _slip_after(dt, free_x, slip_x, push_x, force_x, stiff_x),
+            _slip_after(dt, free_y, slip_y, push_y, force_y, stiff_y),
             speed,
             grip,
             dt,

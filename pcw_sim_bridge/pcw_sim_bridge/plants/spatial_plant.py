@@ -23,6 +23,8 @@ from .caster_arrays import (
     MOTOR_RHO,
     PHI,
     PHI_DOT,
+    PUSH_X,
+    PUSH_Y,
     RHO,
     RHO_DDOT,
     RHO_DOT,
@@ -221,14 +223,14 @@ class SpatialPlant:
             spin = np.array([0.0, 0.0, twist[2]])
             velocity = rotation @ np.array([twist[0], twist[1], 0.0]) + np.cross(spin, rotation @ self._com_in_base)
             self._engine.set_velocity(velocity, spin)
-        self._read()
+        self._read_as_put()
         self._effects.align_motors(joint_position, joint_velocity)
 
     def _place(self, pose: FloatArray, height: float, attitude: FloatArray, joints: FloatArray) -> None:
         origin = np.array([pose[0], pose[1], height])
         self._engine.place(origin + rotation_matrix(attitude) @ self._com_in_base, attitude)
         self._engine.put_joints(joints, np.zeros_like(joints))
-        self._read()
+        self._read_as_put()
         self._effects.align_motors(self._wheels[:, RHO : PHI + 1], self._wheels[:, RHO_DOT : PHI_DOT + 1])
 
     def _stop_all_but_sinking(self, joints: FloatArray) -> None:
@@ -236,7 +238,7 @@ class SpatialPlant:
         _, _, sinking, roll_rate, pitch_rate, _ = self._base[7:]
         self._engine.set_velocity(np.array([0.0, 0.0, sinking]), np.array([roll_rate, pitch_rate, 0.0]))
         self._engine.put_joints(joints, np.zeros_like(joints))
-        self._read()
+        self._read_as_put()
         self._wheels[:, ZX : ZY + 1] = 0.0  # nor do the tyres hold it in a tilt
 
     def _read(self) -> None:
@@ -244,6 +246,11 @@ class SpatialPlant:
         angle, rate = self._engine.read(self._base)
         self._wheels[:, RHO : PHI + 1] = angle
         self._wheels[:, RHO_DOT : PHI_DOT + 1] = rate
+
+    def _read_as_put(self) -> None:
+        """Read the state of joints that were just put so, whatever pushed them before."""
+        self._read()
+        self._wheels[:, PUSH_X : PUSH_Y + 1] = np.nan
 
     def _single_step(self, command: FloatArray) -> None:
         before, rates_before = self._base.copy(), self._wheels[:, RHO_DOT : PHI_DOT + 1].copy()
@@ -291,7 +298,7 @@ class SpatialPlant:
             raise PlantError("motor_torque holds NaN or infinity; allowed: finite torques in N m")
         for _ in range(steps):
             self._single_step(motor_torque)
-        if not (np.isfinite(self._base).all() and np.isfinite(self._wheels).all()):
+        if not (np.isfinite(self._base).all() and np.isfinite(self._wheels[:, :PUSH_X]).all()):
             raise PlantError(f"the plant's state is not finite at {self._steps * self.dt:.3f} s")
 
     def state(self) -> PlantState:
