@@ -455,7 +455,7 @@ def test_a_fit_with_a_known_number_has_the_evidence_of_what_is_left() -> None:
     problem = geared_problem(0.05, 0.3)
     search = EffectSearch(problem, np.random.default_rng(0))
     regression = search.whiten_at(problem.residual, white=True)
-    [(rival, fit)] = search.as_usual(regression, (), Instance(0, (), (0,)))
+    [(rival, fit)] = search.usual_rivals(regression, (), Instance(0, (), (0,)))
     rest = problem.residual - 0.3 * problem.columns(1, ())[..., 1]
     without = regression.moved(dataclasses.replace(problem, residual=rest)).fit((rival,))
     assert fit.mean == pytest.approx([without.mean[0], 0.3])

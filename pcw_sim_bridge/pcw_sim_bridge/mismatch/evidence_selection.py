@@ -278,14 +278,14 @@ class EffectSearch(SetGrowth):
                 found.append(rival)
             if len(found) == MOST_ALIKE or candidate.gain < selection.losses[selection.fit.instances.index(own)] - FAR:
                 break
-        usual = self.as_usual(regression, others, own)
+        usual = self.usual_rivals(regression, others, own)
         found += [rival for rival, fit in usual if fit.log_evidence > selection.fit.log_evidence - ALIKE]
         return found
 
-    def as_usual(
+    def usual_rivals(
         self, regression: WhitenedRegression, others: tuple[Instance, ...], own: Instance
     ) -> list[tuple[Instance, Fit]]:
-        """What looks like an effect together with what it usually is besides, as it is named, and the fit of both to that.
+        """Effects that look like one where their refinements are as they usually are, each with its fit beside the others.
 
         Teeth with play give way, too. Of a small play that is nearly all that is seen, and a soft gear does it as well.
         """
@@ -300,7 +300,8 @@ class EffectSearch(SetGrowth):
                 if self.repeats(candidate.instance, others):
                     continue
                 whole = dataclasses.replace(candidate.instance, active=tuple(range(len(term.parameters))))
-                fit = _known(regression.fit((*others, whole)), usual, np.array([term.parameters[k].deviation for k in usual]))
+                expected = np.array([term.parameters[k].deviation for k in usual])
+                fit = _with_known(regression.fit((*others, whole)), usual, expected)
                 if regression.within_bounds(fit):
                     found.append((candidate.instance, fit))
         return found
@@ -499,7 +500,7 @@ class EffectSearch(SetGrowth):
         return Selection(regression, fit, threshold, tuple(losses), tuple(held_out), (*self.ladder, *named))
 
 
-def _known(fit: Fit, values: Mapping[int, float], deviations: FloatArray) -> Fit:
+def _with_known(fit: Fit, values: Mapping[int, float], deviations: FloatArray) -> Fit:
     """Return a fit with some numbers of its last instance known, by position; `deviations` (K,) is what was expected of them.
 
     Its evidence is larger by how much surer of these values one is with the recordings than before.

@@ -564,7 +564,7 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
             rivals.append(difference)
             if difference > -AMBIGUOUS:
                 alike.append(problem.terms[refined[position].term].effect)
-    for rival, usual in search.as_usual(regression, others, own):
+    for rival, usual in search.usual_rivals(regression, others, own):
         rivals.append(regression.log_odds(usual, fit))
         if rivals[-1] > -AMBIGUOUS:
             alike.append(_called(problem.terms[own.term], problem.terms[rival.term]))

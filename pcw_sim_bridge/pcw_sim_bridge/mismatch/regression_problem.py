@@ -92,8 +92,8 @@ class LinearParameter:
 
     Attributes:
         lower, upper, deviation: bounds and prior deviation of the coefficient.
-        refinement: zero unless there is evidence for it; not part of the effect when it is first named.
-        usual: coefficient that a refinement has where nobody knows better; None where that is zero.
+        refinement: not part of the effect when it is first named; zero, or `usual`, unless there is evidence for it.
+        usual: coefficient that a refinement has where nobody knows better; None: zero.
         origin: value of the parameter where the coefficient is zero.
         reciprocal: the coefficient is the inverse of the parameter's distance from `pole`, less that of the origin's;
             squared: it is its square.

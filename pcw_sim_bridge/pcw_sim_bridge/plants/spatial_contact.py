@@ -110,9 +110,10 @@ def _joint_inertia(caster, along):  # type: ignore[no-untyped-def]
 
 @compiled
 def _behind_gear(dt, mobility, arm, inertia, gear, state):  # type: ignore[no-untyped-def]
-    """The mobility of a contact [1/kg] that a motor behind a gear is carried along with, as far as the gear grips.
+    """Mobility of a contact [1/kg] where a motor behind a gear turns with the joint, as far as the gear grips.
 
-    A gear that hardly gives way is none: the motor adds to what a force at an arm [m] turns of an inertia [kg m^2].
+    A force at an arm [m] on the joint's inertia [kg m^2] moves the motor, too: behind a gear that hardly gives way as
+    behind none.
     """
     if gear[GEAR] == 0.0:
         return mobility
@@ -153,8 +154,8 @@ def _pushes(dt, mobility, change, force_before, push_before, force):  # type: ig
 def _slip_after(dt, mobility, slip, push, force, stiffness):  # type: ignore[no-untyped-def]
     """Slip at the end of a step, in which a stiff tyre under a light wheel has turned back long before its end.
 
-    The tyre follows its slip to first order. A mobility that is too large damps; one that is too small would let the step
-    swing up.
+    The tyre follows its slip to first order. A mobility that is too large damps; one below three quarters of the true one
+    would let the step swing up.
     """
     return slip + dt * mobility * (push - force) / (1.0 + dt * mobility * stiffness)
 
@@ -185,7 +186,7 @@ def contact_wrench(  # type: ignore[no-untyped-def]
         time: since the start [s].
         chassis_mass: of the base link [kg].
         casters: constant numbers (n, TYRE + TYRE_SIZE).
-        mobility: what a force along and across each wheel does at least to its slip (n, 2) [1/kg]; see `contact_mobility`.
+        mobility: what a force along and across each wheel does at most to its slip (n, 2) [1/kg]; see `contact_mobility`.
         suspension: vertical stiffness [N/m] and damping [N s/m] of one wheel.
         body_rotors: reflected rotors that the engine carries in fork and wheel, not on the joints (n, 2, 2) [kg m^2].
         effects: see `EffectTables`.
