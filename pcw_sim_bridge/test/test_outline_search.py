@@ -83,7 +83,7 @@ def test_the_outline_of_a_patch_is_found_from_that_of_a_disc(outline):
         assert shape["yaw"] == pytest.approx(outline["yaw"], abs=0.12)
     # Not by chance: the true one is hardly better.
     trials = ShapeTrials(regression, (), found)
-    best, true = (evidence for evidence, _ in trials.evidence([found, shaped(outline)]))
+    best, true = (trial.evidence for trial in trials.tried([found, shaped(outline)]))
     assert best > true - 2.0
     assert best <= tried.evidence.max() + 1e-6
 
@@ -107,7 +107,7 @@ def test_where_few_wheels_crossed_a_patch_its_interval_holds_what_else_it_may_be
     for known in (outline, mirrored):
         assert estimates["yaw"].low < known["yaw"] < estimates["yaw"].high
     trials = ShapeTrials(selection.regression, (), selection.fit.instances[0])
-    found, true = (evidence for evidence, _ in trials.evidence([selection.fit.instances[0], shaped(outline)]))
+    found, true = (trial.evidence for trial in trials.tried([selection.fit.instances[0], shaped(outline)]))
     assert found > true - 2.0
     assert estimates["size"].low < 0.3 < estimates["size"].high
 

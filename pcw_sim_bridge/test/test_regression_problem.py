@@ -246,10 +246,11 @@ def test_a_shape_that_is_tried_has_the_evidence_of_its_fit():
     for others in ((), (Instance(0, (("phase", 2.3),), (0,)),)):
         trials = ShapeTrials(regression, others, Instance(0, (("phase", 0.5),), (0,)))
         instances = [Instance(0, (("phase", phase),), (0,), occam=1.5) for phase in (0.5, 0.7, 1.0, 3.5)]
-        for instance, (evidence, allowed) in zip(instances, trials.evidence(instances), strict=True):
+        for instance, trial in zip(instances, trials.tried(instances), strict=True):
             fit = regression.fit([*others, instance])
-            assert evidence == pytest.approx(fit.log_evidence, abs=1e-6)
-            assert allowed == regression.each_within_bounds(fit)[-1]
+            assert trial.evidence == pytest.approx(fit.log_evidence, abs=1e-6)
+            assert trial.allowed == regression.each_within_bounds(fit)[-1]
+            assert trial.coefficients == pytest.approx(fit.mean[-1:], rel=1e-6)
 
 
 def test_a_shape_is_found_where_the_fit_was_made_exact_far_from_it():

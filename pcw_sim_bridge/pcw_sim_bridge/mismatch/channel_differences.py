@@ -40,7 +40,8 @@ class ChannelDifferences:
             state = rolling_state(motion, model.numbers, model.layout, around)
             straight = StraightTyres.about(model.numbers, state.force, state.grip)
             self._states.append(state)
-            self._around.append(dataclasses.replace(around, straight=straight, normal=normal))
+            places = model.wheel_places(motion)
+            self._around.append(dataclasses.replace(around, straight=straight, normal=normal, places=places))
         self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
         self.known = [np.isfinite(measured) for measured, _ in self._sides]
         self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])

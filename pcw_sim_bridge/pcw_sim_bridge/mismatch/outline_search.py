@@ -115,14 +115,16 @@ class _Tried:
     def __init__(self, trials: ShapeTrials, instance: Instance) -> None:
         self._trials, self._instance = trials, instance
         self._known: dict[tuple[float, ...], float] = {}
+        self._coefficients: dict[tuple[float, ...], FloatArray] = {}
 
     def evidence(self, outlines: Sequence[FloatArray]) -> list[float]:
         """Log evidence of each; none where the size of the effect would have to be one that cannot be."""
         keys = [tuple(outline.tolist()) for outline in outlines]
         new = [key for key in dict.fromkeys(keys) if key not in self._known]
-        found = self._trials.evidence([self._with(key) for key in new]) if new else []
-        for key, (value, allowed) in zip(new, found, strict=True):
-            self._known[key] = value if allowed else -math.inf
+        found = self._trials.tried([self._with(key) for key in new]) if new else []
+        for key, trial in zip(new, found, strict=True):
+            self._known[key] = trial.evidence if trial.allowed else -math.inf
+            self._coefficients[key] = trial.coefficients
         return [self._known[key] for key in keys]
 
     def climb(self, outline: FloatArray) -> FloatArray:
@@ -199,9 +201,11 @@ class _Tried:
         """All that are not far below the best."""
         best = max(self._known.values())
         keys = [key for key, value in self._known.items() if value > best - FAR]
-        coefficients = self._trials.coefficients([self._with(key) for key in keys])
-        evidence = np.array([self._known[key] for key in keys])
-        return Outlines(np.array([_upright(key) for key in keys]), evidence, coefficients)
+        return Outlines(
+            outlines=np.array([_upright(key) for key in keys]),
+            evidence=np.array([self._known[key] for key in keys]),
+            coefficients=np.array([self._coefficients[key] for key in keys]),
+        )
 
     def _with(self, outline: Sequence[float]) -> Instance:
         shape = dict(self._instance.shape) | dict(zip(OUTLINE, outline, strict=True))

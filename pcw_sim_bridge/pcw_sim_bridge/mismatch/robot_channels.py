@@ -222,8 +222,7 @@ class RobotProblemBuilder:
         """Places (T, n, 2) [m] and headings (T, n) [rad] of the wheels in the world."""
         places, headings = [], []
         for motion, own in zip(self.motions, self.filters, strict=True):
-            centres = np.stack([self.model.wheel_places(motion, i) for i in range(self.robot.n)], axis=1)
-            places.append(own.decimate(centres))
+            places.append(own.decimate(self.model.wheel_places(motion).swapaxes(0, 1)))
             headings.append(own.decimate(motion.pose[:, 2:] + self.numbers.headings(motion.position)))
         return np.concatenate(places), np.concatenate(headings)
 

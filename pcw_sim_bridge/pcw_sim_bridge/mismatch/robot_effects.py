@@ -216,42 +216,43 @@ def _later(motion: RobotMotion, values: FloatArray, offset: float) -> FloatArray
 
 
 @compiled_for_kernel(
-    ARRAY_SIGNATURE, "float64[:, ::1]", "float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[::1]"
+    ARRAY_SIGNATURE, "float64[:, :, ::1]", "float64[::1], float64[::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1]"
 )
 def _contacts_along(kernel, values, time, place, roll_angle, load):  # type: ignore[no-untyped-def]
-    """Results (T, CONTACT_RESULTS) of a contact's kernel under one wheel that is at place (T, 2).
+    """Results (W, T, CONTACT_RESULTS) of a contact's kernel under wheels that are at places (W, T, 2).
 
     Where a wheel comes upon other ground between two samples, they have the mean of the friction on the way.
     """
-    count = len(time)
-    found = np.zeros((count, CONTACT_RESULTS))
-    at = np.zeros(CONTACT_INPUTS)
-    for t in range(count):
-        found[t, FRICTION] = 1.0
-        at[CONTACT_TIME], at[CONTACT_X], at[CONTACT_Y] = time[t], place[t, 0], place[t, 1]
-        at[ROLL_ANGLE], at[LOAD] = roll_angle[t], load[t]
-        kernel(at, values, found[t])
-    friction = found[:, FRICTION].copy()
-    one = np.zeros(CONTACT_RESULTS)
-    for t in range(count):
-        before, after = max(t - 1, 0), min(t + 1, count - 1)
-        if friction[before] == friction[t] == friction[after]:
-            continue
-        total = 0.0
-        for k in range(BETWEEN_SAMPLES):
-            way = (k + 0.5) / BETWEEN_SAMPLES - 0.5
-            other = after if way > 0.0 else before
-            part = abs(way)
-            at[CONTACT_TIME] = time[t] + part * (time[other] - time[t])
-            at[CONTACT_X] = place[t, 0] + part * (place[other, 0] - place[t, 0])
-            at[CONTACT_Y] = place[t, 1] + part * (place[other, 1] - place[t, 1])
-            at[ROLL_ANGLE] = roll_angle[t] + part * (roll_angle[other] - roll_angle[t])
-            at[LOAD] = load[t] + part * (load[other] - load[t])
-            one[:] = 0.0
-            one[FRICTION] = 1.0
-            kernel(at, values, one)
-            total += one[FRICTION]
-        found[t, FRICTION] = total / BETWEEN_SAMPLES
+    wheels, count = load.shape
+    found = np.zeros((wheels, count, CONTACT_RESULTS))
+    at, one = np.zeros(CONTACT_INPUTS), np.zeros(CONTACT_RESULTS)
+    friction = np.empty(count)
+    for i in range(wheels):
+        for t in range(count):
+            found[i, t, FRICTION] = 1.0
+            at[CONTACT_TIME], at[CONTACT_X], at[CONTACT_Y] = time[t], place[i, t, 0], place[i, t, 1]
+            at[ROLL_ANGLE], at[LOAD] = roll_angle[i, t], load[i, t]
+            kernel(at, values, found[i, t])
+            friction[t] = found[i, t, FRICTION]
+        for t in range(count):
+            before, after = max(t - 1, 0), min(t + 1, count - 1)
+            if friction[before] == friction[t] == friction[after]:
+                continue
+            total = 0.0
+            for k in range(BETWEEN_SAMPLES):
+                way = (k + 0.5) / BETWEEN_SAMPLES - 0.5
+                other = after if way > 0.0 else before
+                part = abs(way)
+                at[CONTACT_TIME] = time[t] + part * (time[other] - time[t])
+                at[CONTACT_X] = place[i, t, 0] + part * (place[i, other, 0] - place[i, t, 0])
+                at[CONTACT_Y] = place[i, t, 1] + part * (place[i, other, 1] - place[i, t, 1])
+                at[ROLL_ANGLE] = roll_angle[i, t] + part * (roll_angle[i, other] - roll_angle[i, t])
+                at[LOAD] = load[i, t] + part * (load[i, other] - load[i, t])
+                one[:] = 0.0
+                one[FRICTION] = 1.0
+                kernel(at, values, one)
+                total += one[FRICTION]
+            found[i, t, FRICTION] = total / BETWEEN_SAMPLES
     return found
 
 
@@ -324,14 +325,15 @@ class ChannelModel:
         pull = self._pull(motion, change)
         return dataclasses.replace(around, pull=pull if around.pull is None else around.pull + pull)
 
-    def wheel_places(self, motion: RobotMotion, i: int) -> FloatArray:
-        """Centre of wheel i in the world (T, 2) [m]."""
-        heading = self.numbers.headings(motion.position)[:, i]
+    def wheel_places(self, motion: RobotMotion) -> FloatArray:
+        """Centres of the casters' wheels in the world (n, T, 2) [m]."""
+        heading = self.numbers.headings(motion.position)
         c, s = np.cos(heading), np.sin(heading)
-        (bx, by), (sx, sy) = self.numbers.caster_offset[i], self.numbers.steer_axis[i]
+        (bx, by), (sx, sy) = self.numbers.caster_offset.T, self.numbers.steer_axis.T
         x, y = sx + bx * c - by * s, sy + bx * s + by * c
-        c, s = np.cos(motion.pose[:, 2]), np.sin(motion.pose[:, 2])
-        places: FloatArray = motion.pose[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
+        c, s = np.cos(motion.pose[:, 2:]), np.sin(motion.pose[:, 2:])
+        turned = np.stack([(c * x - s * y).T, (s * x + c * y).T], axis=2)
+        places: FloatArray = motion.pose[:, :2] + turned
         return places
 
     def _under_wheels(
@@ -348,16 +350,13 @@ class ChannelModel:
         assert isinstance(effect, ContactEffect)
         values = effect.values(instance.parameters)
         casters = [self.robot.caster_index(name) for name in instance.target]
-        places = {i: self.wheel_places(motion, i) for i in casters}
+        places = np.ascontiguousarray((self.wheel_places(motion) if around.places is None else around.places)[casters])
+        roll_angle = np.ascontiguousarray(motion.position[:, casters, DRIVE].T)
         height = np.zeros(motion.position.shape[:2])
         for _ in range(LOAD_ROUNDS):
-            under = {
-                i: _contacts_along(
-                    effect.contact, values, motion.time, places[i],
-                    np.ascontiguousarray(motion.position[:, i, DRIVE]), np.ascontiguousarray(normal[:, i]),
-                )
-                for i in casters
-            }  # fmt: skip
+            load = np.ascontiguousarray(normal[:, casters].T)
+            results = _contacts_along(effect.contact, values, motion.time, places, roll_angle, load)
+            under = dict(zip(casters, results, strict=True))
             before, height = height, np.zeros(motion.position.shape[:2]) if around.height is None else around.height.copy()
             for i, found in under.items():
                 height[:, i] += found[:, HEIGHT] + found[:, RADIUS_CHANGE]

@@ -179,6 +179,7 @@ class Surroundings:
         pull: of gravity along base_link's axes (T, 2) [m/s^2].
         straight: the tyres' curves straightened about where they are without a small change; None: the curves themselves.
         normal: loads of the wheels along the motion, on level ground (T, n) [N]; None: to be found when they are needed.
+        places: of the wheels in the world, by caster (n, T, 2) [m]; None as above.
     """
 
     torque: FloatArray | None = None
@@ -189,6 +190,7 @@ class Surroundings:
     pull: FloatArray | None = None
     straight: StraightTyres | None = None
     normal: FloatArray | None = None
+    places: FloatArray | None = None
 
 
 NOTHING = Surroundings()

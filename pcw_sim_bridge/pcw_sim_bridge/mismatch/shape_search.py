@@ -39,11 +39,11 @@ def refined_shape(
         return instance
     trials = ShapeTrials(regression, others, instance)
     for sweep in range(SWEEPS):
-        before = trials.evidence([instance])[0][0]
+        before = trials.tried([instance])[0].evidence
         for name, (kind, spacing) in resolution.items():
             place = _Place(trials, instance, name, kind, bounded=True)
             instance = place.moved(_largest(place, place.width(spacing), coarse and sweep == 0))
-        if len(resolution) < 2 or trials.evidence([instance])[0][0] < before + WORTH:
+        if len(resolution) < 2 or trials.tried([instance])[0].evidence < before + WORTH:
             break
     return instance
 
@@ -95,7 +95,7 @@ class _Place:
         self._known: dict[float, float] = {}
         self.whole = trials.whole
         # A size that cannot be is no better an explanation for its larger evidence, unless no other is known.
-        self._bounded = bounded and trials.evidence([instance])[0][1]
+        self._bounded = bounded and trials.tried([instance])[0].allowed
 
     def width(self, spacing: float) -> float:
         """Distance of a neighbour on the grid."""
@@ -120,9 +120,9 @@ class _Place:
     def look_at(self, steps: Sequence[float]) -> None:
         """Find the evidence at several steps at once, which takes hardly longer than at one."""
         new = [step for step in dict.fromkeys(steps) if step not in self._known]
-        found = self._trials.evidence([self.moved(step) for step in new]) if new else []
-        for step, (evidence, allowed) in zip(new, found, strict=True):
-            self._known[step] = -math.inf if self._bounded and not allowed else evidence
+        found = self._trials.tried([self.moved(step) for step in new]) if new else []
+        for step, trial in zip(new, found, strict=True):
+            self._known[step] = -math.inf if self._bounded and not trial.allowed else trial.evidence
 
 
 def _largest(place: _Place, width: float, coarse: bool) -> float:

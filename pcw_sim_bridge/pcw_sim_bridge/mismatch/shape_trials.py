@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -10,7 +11,13 @@ from scipy import linalg
 from .regression_problem import FloatArray
 from .whitened_regression import Instance, WhitenedRegression, marginal_gains
 
-AT_ONCE = 64  # instances whose columns are held at a time
+
+class Trial(NamedTuple):
+    """A set with one instance beside it: its log evidence, whether the parameters are within bounds, and their values (P,)."""
+
+    evidence: float
+    allowed: bool
+    coefficients: FloatArray
 
 
 class ShapeTrials:
@@ -35,30 +42,20 @@ class ShapeTrials:
         self._lower, self._upper = np.array([p.lower for p in parameters]), np.array([p.upper for p in parameters])
         self._without = regression.fit(others).log_evidence + term.log_prior
 
-    def evidence(self, instances: Sequence[Instance]) -> list[tuple[float, bool]]:
-        """Log evidence of the set with each of some instances of that term, and whether its parameters are within bounds."""
+    def tried(self, instances: Sequence[Instance]) -> list[Trial]:
+        """What the set makes of each of some instances of that term."""
         own, cross, moment = self._products(instances)
+        gains, means = marginal_gains(own, cross, moment, self._projected, self._deviations)
+        gains, means = gains[:, 0], means[:, :, 0]
+        allowed = np.all((means >= self._lower) & (means <= self._upper), axis=1)
         if self.whole:
             size = own[:, 0, 0] - np.sum(cross**2, axis=0)
-            product = moment[:, 0] - (cross.T @ self._projected)[:, 0]
-            return [
-                (self._without + float(gain) - instance.occam, True)
-                for instance, gain in zip(instances, product - 0.5 * size, strict=True)
-            ]
-        gains, means = marginal_gains(own, cross, moment, self._projected, self._deviations)
-        allowed = np.all((means[:, :, 0] >= self._lower) & (means[:, :, 0] <= self._upper), axis=1)
+            gains = moment[:, 0] - (cross.T @ self._projected)[:, 0] - 0.5 * size
+            allowed[:] = True
         return [
-            (self._without + float(gain) - instance.occam, bool(within))
-            for instance, gain, within in zip(instances, gains[:, 0], allowed, strict=True)
+            Trial(self._without + float(gain) - instance.occam, bool(within), mean)
+            for instance, gain, within, mean in zip(instances, gains, allowed, means, strict=True)
         ]
-
-    def coefficients(self, instances: Sequence[Instance]) -> FloatArray:
-        """Return what the active parameters of each come out as (len(instances), P)."""
-        found = []
-        for start in range(0, len(instances), AT_ONCE):
-            own, cross, moment = self._products(instances[start : start + AT_ONCE])
-            found.append(marginal_gains(own, cross, moment, self._projected, self._deviations)[1][:, :, 0])
-        return np.concatenate(found)
 
     def _products(self, instances: Sequence[Instance]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Gram matrices of the columns of each instance, and their products with the set and with the target."""

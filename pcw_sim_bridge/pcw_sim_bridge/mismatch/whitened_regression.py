@@ -183,6 +183,7 @@ class WhitenedRegression:
         self._long_scans: dict[int, tuple[npt.NDArray[np.float32], FloatArray]] = {}
         self._short_scans: list[_ScanGroup] | None = None
         self._tried: OrderedDict[tuple[int, Frozen], FloatArray] = OrderedDict()
+        self._tried_bytes = 0
 
     def _rows(self, values: FloatArray) -> FloatArray:
         """Whiten (T, C) or (T, C, K), keep usable rows, apply root weights -> (R,) or (R, K)."""
@@ -204,6 +205,7 @@ class WhitenedRegression:
         self._bank.rescale(factors)
         self._long_scans.clear()
         self._tried.clear()
+        self._tried_bytes = 0
         self._short_scans = None
 
     def block_labels(self) -> list[int]:
@@ -257,10 +259,12 @@ class WhitenedRegression:
             edges = np.cumsum([columns.shape[2] for columns in raw])[:-1]
             known |= zip(new, np.split(self._rows(np.concatenate(raw, axis=2)), edges, axis=1), strict=True)
         for key in known:
+            if key not in self._tried:
+                self._tried_bytes += known[key].nbytes
             self._tried[key] = known[key]
             self._tried.move_to_end(key)
-        while sum(columns.nbytes for columns in self._tried.values()) > TRIED_BYTES and len(self._tried) > 1:
-            self._tried.popitem(last=False)
+        while self._tried_bytes > TRIED_BYTES and len(self._tried) > 1:
+            self._tried_bytes -= self._tried.popitem(last=False)[1].nbytes
         return [
             known[key][:, list(instance.active)] if key in known else self.columns(instance)
             for key, instance in zip(keys, instances, strict=True)
