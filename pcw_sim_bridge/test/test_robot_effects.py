@@ -89,18 +89,21 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
         # Two of these steerings do not turn once: no wave over their own angle can be told, but one that is there for all.
         ("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
                          "cosine": 0.03, "sine": -0.02}, 0.001),
+        # A steering that turns one way here and the other way there leaves a torque by its angle where that is not named.
+        ("reduced", 1, {"name": "steer_coulomb_friction", "target": ["front_left"], "coulomb": 0.4,
+                     "asymmetry": -0.15}, 0.003),
     ],
-    ids=["a tyre behind its own number", "coggings of all as one"],
+    ids=["a tyre behind its own number", "coggings of all as one", "a friction by direction behind an angle"],
 )  # fmt: skip
 def test_what_hid_is_named(plant: str, seed: int, entry: dict[str, object], within: float, tmp_path: Path) -> None:
-    """Nothing was missing, to say the one; two coggings and a law from outside, to say the other."""
+    """Nothing was missing, to say the first; two coggings and a law from outside, an unknown of an angle, to say the rest."""
     excitation = make_excitation("identification", THESIS, 25.0, seed)
     true_robot = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
     record_run(true_robot, excitation.twist, excitation.duration, seed, tmp_path / "run", plant, controlled_as=THESIS)
     findings = analyse(RobotSubject(THESIS), [tmp_path / "run"], [], {}, 0, lambda message: None).findings
     [effect] = findings.effects
     assert (effect.name, list(effect.target), findings.unknown) == (entry["name"], entry["target"], ())
-    for name in {"error", "cosine", "sine"} & set(entry):
+    for name in {"error", "cosine", "sine", "coulomb", "asymmetry"} & set(entry):
         found, true = effect.parameters[name], float(entry[name])  # type: ignore[arg-type]
         assert abs(found.value - true) < within
         assert found.low < true < found.high

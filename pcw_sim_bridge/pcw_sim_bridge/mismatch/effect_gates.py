@@ -51,7 +51,6 @@ class EffectGates:
         changes: list[FloatArray] = []
         retunings, bursts = [], []
         explained = predicted(self.problem, fit)
-        position = len(self.problem.nuisances)
         for index, instance in enumerate(instances):
             others = instances[:index] + instances[index + 1 :]
             without = regression.fit(others)
@@ -61,9 +60,7 @@ class EffectGates:
             once = self.problem.terms[instance.term].once
             support = losses[-1] if once else 0.5 * float(np.sum(regression.block_scores(others) - full_scores))
             held_out.append(support + retuning)
-            columns = self.problem.columns(instance.term, instance.shape)[..., list(instance.active)]
-            part = columns @ fit.mean[position : position + len(instance.active)]
-            position += len(instance.active)
+            part = self._contribution(fit, index)
             own.append(self._sizes(part))
             # What a term does for the prediction is what the others cannot do in its place.
             change = explained - predicted(self.problem, without)
@@ -100,6 +97,21 @@ class EffectGates:
         counts = np.maximum(valid.sum(axis=0), 1)
         sizes: FloatArray = np.sqrt(np.sum(np.where(valid, values, 0.0) ** 2, axis=0) / counts)
         return sizes
+
+    def refinement_counts(self, regression: WhitenedRegression, fit: Fit, position: int, refined: Fit) -> bool:
+        """Whether what an instance, at a position among those of a fit, does otherwise where it is refined is worth a name."""
+        remains = channel_deviations(regression.unwhitened_residual(refined), self.problem.valid)
+        change = predicted(self.problem, refined) - predicted(self.problem, fit)
+        floors = remains, self.settings.smallest_part * self._sizes(self._contribution(refined, position))
+        return self._share(regression, [fit.instances[position]], change, self._sizes(change), floors) >= 1.0
+
+    def _contribution(self, fit: Fit, position: int) -> FloatArray:
+        """What one instance of a fit adds to the residual (T, C)."""
+        instance = fit.instances[position]
+        first = len(self.problem.nuisances) + sum(len(other.active) for other in fit.instances[:position])
+        columns = self.problem.columns(instance.term, instance.shape)[..., list(instance.active)]
+        contribution: FloatArray = columns @ fit.mean[first : first + len(instance.active)]
+        return contribution
 
     def needed_together(
         self, regression: WhitenedRegression, instances: tuple[Instance, ...], fit: Fit

@@ -360,16 +360,19 @@ class _Refined:
 
 
 def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) -> _Refined | None:
-    """The set with the one refinement that gains most, if any explains a leftover or stands for a plain effect."""
+    """The set with the one refinement that gains most, if any explains what is left or stands for a plain effect.
+
+    Whatever a leftover seems to depend on, and where none is told as well, if the refinement passes the gates of an effect: a
+    friction that differs between directions leaves, of a steering, a torque by its angle, or noise that it is itself.
+    """
     problem, threshold = search.problem, selection.threshold
-    variables = {leftover.variable for leftover in result.leftovers}
     best: _Refined | None = None
     plain = selection.fit.instances
     before = float(np.sum(search.residual_of(plain)[problem.valid] ** 2))
     for position, instances in _refinements(problem, plain):
-        leftover = bool(variables & set(problem.terms[plain[position].term].arguments))
         own = selection.regression
-        if not leftover and own.fit(instances).log_evidence < selection.fit.log_evidence + threshold:
+        under_own = own.fit(instances)
+        if not result.leftovers and under_own.log_evidence < selection.fit.log_evidence + threshold:
             continue
         residual = search.residual_of(instances)
         # Judged under the noise of the better model: under that of the worse one a refinement is "slow noise".
@@ -386,7 +389,10 @@ def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) 
         solid = [instance for instance in kept if instance not in undecided]
         instead = regression.fit(solid).log_evidence + REFINEMENT_LOG_PRIOR - plain_fit.log_evidence
         stands_in = len(solid) < len(plain) and instead > AMBIGUOUS
-        if (leftover and share > SMALLEST_SHARE) or stands_in:
+        explains = result.leftovers or EffectGates(problem, search.settings).refinement_counts(
+            own, selection.fit, position, under_own
+        )
+        if (explains and share > SMALLEST_SHARE) or stands_in:
             best = _Refined(plain, kept, kept.index(instances[position]), undecided, gain, share)
     return None if best is None else _searched_again(search, best, threshold)
 
@@ -559,7 +565,8 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     where_exact = {rival: odds for (named, rival), odds in search.where_exact.items() if named == own.term}
     for position, refined in _refinements(problem, others):
         trial = regression.fit(refined)
-        difference = trial.log_evidence + REFINEMENT_LOG_PRIOR - fit.log_evidence
+        # A refined law in place of a further effect is as likely as that: neither is the plainer one.
+        difference = trial.log_evidence - fit.log_evidence
         if regression.within_bounds(trial):
             rivals.append(difference)
             if difference > -AMBIGUOUS:
