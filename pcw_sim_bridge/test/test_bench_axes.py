@@ -152,6 +152,23 @@ def test_asymmetry_is_named_where_it_is(effects: tuple[str, ...], asymmetric: st
     assert explanation.complete
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("asymmetric", [True, False], ids=["a friction by direction", "a load"])
+def test_a_load_and_a_friction_by_direction_are_one_or_the_other(asymmetric: bool, seed: int) -> None:
+    """They differ at rest only. The friction by direction was a symmetric one and a load, both named as sure."""
+    effects = (VISCOUS, COULOMB) if asymmetric else (VISCOUS, COULOMB, LOAD)
+    overrides = {COULOMB: {"asymmetry": -0.3 if asymmetric else 0.0}}
+    case = draw_bench_case(np.random.default_rng([seed, 2]), effects, 0.5, motion="sines", overrides=overrides, noise=0.05)
+    named = {entry.term.effect: entry for entry in explained(case).named}
+    truth = next(instance for instance in case.truth if instance.name == COULOMB).parameters
+    if asymmetric:
+        assert set(named) == set(effects)
+        estimate = named[COULOMB].estimates["asymmetry"]
+        assert estimate.low < truth["asymmetry"] < estimate.high
+    elif set(named) != set(effects):
+        assert set(named) == {VISCOUS, COULOMB} and named[COULOMB].ambiguous_with == (LOAD,)
+
+
 ARM = {"right": {}, "heavy": {"moment": 1.3}}
 
 

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from pcw_sim_bridge.mismatch.effect_gates import EffectGates
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.explanation import named_terms
 from pcw_sim_bridge.mismatch.outline_search import OUTLINE, has_outline, searched_outline
@@ -110,6 +111,20 @@ def test_where_few_wheels_crossed_a_patch_its_interval_holds_what_else_it_may_be
     found, true = (trial.evidence for trial in trials.tried([selection.fit.instances[0], shaped(outline)]))
     assert found > true - 2.0
     assert estimates["size"].low < 0.3 < estimates["size"].high
+
+
+def test_a_patch_is_judged_in_its_own_outline_and_not_in_that_of_a_first_look():
+    """A disc at one end of a strip leaves more beside it than it explains: so a patch of 2800 nats was dropped."""
+    strip = {"x": 0.1, "y": 0.0, "length": 1.5, "width": 0.3, "yaw": 0.8, "roundness": 0.0}
+    problem = floor_problem(tracks(32), strip, 0.3)
+    disc = shaped(DISC | {"x": 0.1, "y": 0.0})
+    search = EffectSearch(problem, np.random.default_rng(0))
+    regression = search.whiten_beside((disc,))
+    assert EffectGates(problem, search.settings).judge(regression, (disc,), regression.fit((disc,)))[2][0] < 1.0
+    [patch] = search.prune(regression, (disc,), 9.0).fit.instances
+    shape = dict(patch.shape)
+    for name in ("x", "y", "length", "width"):
+        assert shape[name] == pytest.approx(strip[name], abs=0.06), name
 
 
 def test_a_patch_where_nobody_came_is_nothing():

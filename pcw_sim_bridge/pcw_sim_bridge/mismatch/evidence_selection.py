@@ -435,6 +435,11 @@ class EffectSearch(SetGrowth):
                 continue
             index = min(failing, key=losses.__getitem__)
             loss = losses[index]
+            outlined = self._outlined(regression, instances, index) if loss >= threshold else instances
+            if outlined != instances:
+                instances = self.made_exact(outlined)
+                regression = self.whiten_beside(instances)
+                continue
             self._note_drop(self.label(instances[index]), loss, reasons[index], held_out[index])
             point = self.problem.point
             elsewhere = point is not None and any(size.term == instances[index].term for size in point.sizes)
@@ -458,6 +463,20 @@ class EffectSearch(SetGrowth):
                 self.progress(exchange[0])
                 instances = exchange[1]
         return self.conclude(instances, threshold)
+
+    def _outlined(
+        self, regression: WhitenedRegression, instances: tuple[Instance, ...], index: int
+    ) -> tuple[Instance, ...]:
+        """The set with a patch of floor in the best outline, where it has not been searched yet: a disc may explain little."""
+        instance, others = instances[index], instances[:index] + instances[index + 1 :]
+        if not has_outline(instance) or instance.term in self.outlines:
+            return instances
+        found, tried = searched_outline(regression, others, instance)
+        if tried is not None:
+            self.outlines[instance.term] = tried
+        if found != instance:
+            self.progress(f"{self.label(instance)} as {self.label(found)}, before it is judged")
+        return (*instances[:index], found, *instances[index + 1 :])
 
     def _stand_in(
         self, regression: WhitenedRegression, instances: tuple[Instance, ...], index: int, threshold: float, barred: set[int]

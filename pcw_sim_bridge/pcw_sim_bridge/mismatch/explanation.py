@@ -164,7 +164,7 @@ def explain(
     selection = _with_whole_numbers(search, selection)
     result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
     suspect: Refinement | None = None
-    undecided: dict[Instance, float] = {}
+    doubts: dict[Instance, tuple[float, str]] = {}
     remarks: tuple[str, ...] = ()
     # A refined law of the library comes before any law outside it: what a friction that differs between directions explains
     # is no unknown function of the speed.
@@ -176,7 +176,7 @@ def explain(
         if not finished.vetoed and not {left.variable for left in finished.leftovers} & set(arguments):
             progress(f"refined: {search.label(refined.instances[refined.position])}, {refined.gain:.1f} nats")
             remarks = _remarks(search, selection, refined)
-            selection, undecided = better, refined.undecided
+            selection, doubts = better, refined.doubts(problem)
         else:
             suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
             progress(f"not adopted: {suspect.describe()}")
@@ -190,10 +190,10 @@ def explain(
         if not is_unknown(problem, entry.instance)
     )
     if refined is not None:
-        rival = problem.terms[refined.instances[refined.position].term].effect
         if suspect is not None:
-            undecided = {entry.instance: entry.probability for entry in named if entry.term.effect in suspect.dropped}
-        named = tuple(_doubted(entry, rival, undecided) for entry in named)
+            rival = problem.terms[refined.instances[refined.position].term].effect
+            doubts = {entry.instance: (entry.probability, rival) for entry in named if entry.term.effect in suspect.dropped}
+        named = tuple(_doubted(entry, doubts) for entry in named)
     return Explanation(
         search=search,
         selection=selection,
@@ -305,11 +305,12 @@ def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> E
     )
 
 
-def _doubted(entry: NamedTerm, rival: str, undecided: Mapping[Instance, float]) -> NamedTerm:
-    """The entry, said to be ambiguous with a refined effect if the recording does not decide between them."""
-    if entry.instance not in undecided:
+def _doubted(entry: NamedTerm, doubts: Mapping[Instance, tuple[float, str]]) -> NamedTerm:
+    """The entry, said to be ambiguous with another effect if the recording does not decide between them."""
+    if entry.instance not in doubts:
         return entry
-    return dataclasses.replace(entry, ambiguous_with=(rival,), probability=undecided[entry.instance])
+    probability, rival = doubts[entry.instance]
+    return dataclasses.replace(entry, ambiguous_with=(rival,), probability=probability)
 
 
 def _remarks(search: EffectSearch, plain: Selection, refined: _Refined) -> tuple[str, ...]:
@@ -323,7 +324,8 @@ def _remarks(search: EffectSearch, plain: Selection, refined: _Refined) -> tuple
             continue
         if term.effect == law:
             continue
-        fate = "do not decide whether it is there" if instance in refined.undecided else "decide against it"
+        undecided = instance in refined.undecided or (instance == refined.instead and refined.gain < AMBIGUOUS)
+        fate = "do not decide whether it is there" if undecided else "decide against it"
         numbers = " and ".join(
             f"{term.parameters[k].name} = {value:.3g} {term.parameters[k].unit}"
             for k, value in zip(instance.active, values, strict=True)
@@ -344,6 +346,7 @@ class _Refined:
         position: of the refined instance.
         undecided: probability of instances that the refined set does as well without.
         gain: nats over the plain set; share: part of its remaining mean square that is explained.
+        instead: what the refinement is in the place of; None where it was found beside all others.
     """
 
     plain: tuple[Instance, ...]
@@ -352,6 +355,16 @@ class _Refined:
     undecided: dict[Instance, float]
     gain: float
     share: float
+    instead: Instance | None = None
+
+    def doubts(self, problem: RegressionProblem) -> dict[Instance, tuple[float, str]]:
+        """Probability of what the recording does not decide, and the effect that would do instead."""
+        law = problem.terms[self.instances[self.position].term].effect
+        doubts = {instance: (probability, law) for instance, probability in self.undecided.items()}
+        if self.instead is not None and self.gain < AMBIGUOUS:
+            instead = problem.terms[self.instead.term].effect
+            doubts[self.instances[self.position]] = 1.0 / (1.0 + math.exp(-self.gain)), instead
+        return doubts
 
     def put_out(self, search: EffectSearch) -> tuple[str, ...]:
         """Effects of the plain set that the refined one has no need of."""
@@ -394,7 +407,29 @@ def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) 
         )
         if (explains and share > SMALLEST_SHARE) or stands_in:
             best = _Refined(plain, kept, kept.index(instances[position]), undecided, gain, share)
-    return None if best is None else _searched_again(search, best, threshold)
+    if best is None:
+        return _instead_of_another(search, selection)
+    return _searched_again(search, best, threshold)
+
+
+def _instead_of_another(search: EffectSearch, selection: Selection) -> _Refined | None:
+    """The set with one instance refined in place of another one, if such a smaller set explains more.
+
+    A friction that differs between directions and one with a constant load differ at rest only: beside the load the
+    difference gains nothing, in its place it may do better.
+    """
+    regression, plain = selection.regression, selection.fit.instances
+    best: _Refined | None = None
+    for position, refined in _refinements(search.problem, plain):
+        for other in range(len(plain)):
+            instances = refined[:other] + refined[other + 1 :]
+            if other == position:
+                continue
+            fit = regression.fit(instances)
+            gain = fit.log_evidence - selection.fit.log_evidence
+            if gain > (best.gain if best else 0.0) and regression.within_bounds(fit):
+                best = _Refined(plain, instances, instances.index(refined[position]), {}, gain, 0.0, plain[other])
+    return best
 
 
 def _searched_again(search: EffectSearch, refined: _Refined, threshold: float) -> _Refined:
