@@ -229,7 +229,7 @@ class LawSearch:
         if dropped:
             gain += gain_of_a_smaller_law(regression, trial.instances)
         sure = min(gain, held_out) >= (LAW_MARGIN if dropped else self.threshold)
-        counts = sure and self._matters(problem, with_law, without, replaced)
+        counts = sure and self._matters(problem, trial.law, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
         names, withdrawn = tuple(i for i in self.names if i not in dropped), dropped
         alike = bool(dropped) and (scores[1] - scores[0]) / both < KEPT_PART
@@ -242,10 +242,12 @@ class LawSearch:
             tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
         )
 
-    def _matters(self, problem: RegressionProblem, with_law: Fit, without: Fit, dropped: Sequence[bool]) -> bool:
+    def _matters(
+        self, problem: RegressionProblem, law: Law, with_law: Fit, without: Fit, dropped: Sequence[bool]
+    ) -> bool:
         """Whether the law moves the prediction of some channel by more than details and misjudgements of the model.
 
-        Against a name that it replaces it is enough to differ by a fair part of what the name does. That something is there
+        These are the same at all times: what changes with the time may be a smaller part of what is measured. Against a name that it replaces it is enough to differ by a fair part of what the name does. That something is there
         the name has shown; the model misjudges it by no more than it misjudges everything.
         """
         after = predicted(problem, with_law)
@@ -263,7 +265,7 @@ class LawSearch:
                 continue
             sizes = [float(np.sqrt(np.mean(v[valid, channel] ** 2))) for v in (change, problem.measured, replaced)]
             size, signal, own = sizes
-            enough = max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
+            enough = 0.0 if "time" in law.depends_on else max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
             beside = robust_deviation(left[valid, channel])
             if own > 0.0:
                 enough = min(enough, REPLACED_PART * own)
