@@ -88,6 +88,22 @@ def test_what_a_part_of_another_effect_explains_as_well_is_named_with_it(part_of
     assert entry.probability == pytest.approx(0.49 if doubted else 0.98)
 
 
+LIMIT = {"torque": 1.16, "knee_speed": 1e4, "no_load_speed": 1e5}  # which all four drives reach, two for a few samples
+
+
+@pytest.mark.parametrize("limited", [ROBOT.caster_names, ROBOT.caster_names[:2]])
+def test_drives_that_hardly_reached_the_limit_of_the_others_have_it_unless_they_did_more(limited):
+    """It was a limit of two drives, of all four."""
+    limit = LIMIT if len(limited) == ROBOT.n else LIMIT | {"torque": 1.0}
+    effect = EffectInstance("torque_saturation", limited, limit, "drive")
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 12.0, 1), [effect])
+    findings = command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None)
+    assert {caster for _, instance in findings.named for caster in instance.target} == set(limited)
+    for named, _ in findings.named:
+        assert named.estimates["torque"].value == pytest.approx(limit["torque"], rel=0.01)
+    assert len(findings.notes) == (1 if len(limited) == ROBOT.n else 0)
+
+
 def test_one_joint_at_fault_is_named_alone():
     effects = [EffectInstance("actuator_lag", (ROBOT.caster_names[k],), {"time_constant": t}, "drive")
                for k, t in ((0, 0.004), (2, 0.012))]  # fmt: skip

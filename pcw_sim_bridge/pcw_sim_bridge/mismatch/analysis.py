@@ -157,7 +157,7 @@ def analyse(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
             *(_traces(prover.other, proof.predicted, explanation.fit, "holdout") if prover.other is not None else ()),
         ),
-        notes=_notes(explanation, retuned, prover.other is not None, proof, fit),
+        notes=(*_notes(explanation, retuned, prover.other is not None, proof, fit), *commands.notes),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),

@@ -20,7 +20,7 @@ from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFindi
 from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
-from .regression_problem import UNKNOWN, Channel, FloatArray, RegressionProblem
+from .regression_problem import UNKNOWN, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .whitened_regression import Instance
 
@@ -38,6 +38,7 @@ class CommandFindings:
     Attributes:
         named: effects between commands and torques, each with what it is in a description.
         proofs: held-out errors of every channel.
+        notes: what a reader has to know to judge them.
     """
 
     channels: tuple[ChannelFinding, ...] = ()
@@ -46,6 +47,7 @@ class CommandFindings:
     locations: tuple[LocationFinding, ...] = ()
     proofs: tuple[ChannelProof, ...] = ()
     ladder: tuple[LadderFinding, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def command_findings(
@@ -92,7 +94,7 @@ def command_findings(
             (*found.proofs, proof),
             (*found.ladder, *_ladder(explanation)),
         )
-    return _shared(found, [problem.channels[0] for problem in problems])
+    return _shared(found, problems)
 
 
 def _explanations(
@@ -150,25 +152,42 @@ def with_rivals(explanation: Explanation) -> Explanation:
     return dataclasses.replace(explanation, named=tuple(named))
 
 
-def _shared(found: CommandFindings, channels: Sequence[Channel]) -> CommandFindings:
-    """Make one effect of those that all joints of an axis have alike."""
-    named, locations = list(found.named), list(found.locations)
-    for axis in ("drive", "steer"):
-        casters = tuple(caster for channel in channels if channel.axis == axis for caster in channel.casters)
+def _shared(found: CommandFindings, problems: Sequence[RegressionProblem]) -> CommandFindings:
+    """Make one effect of those that several joints of an axis have alike, if no other one speaks against having it, too.
+
+    Drives of one kind that were never asked for much more than their limit have the limit of the others.
+    """
+    named, locations, notes = list(found.named), list(found.locations), []
+    for axis in AXIS_NAMES:
+        joints = {caster: p for p in problems if p.channels[0].axis == axis for caster in p.channels[0].casters}
         for effect in dict.fromkeys(n.term.effect for n, _ in named):
             own = [k for k, place in enumerate(locations) if place.axis == axis and named[k][0].term.effect == effect]
             targets = [named[k][0].term.target[0] for k in own]
-            pooled = _pooled([named[k][0] for k in own]) if sorted(targets) == sorted(casters) and len(own) > 1 else None
-            if pooled is None:
+            pooled = _pooled([named[k][0] for k in own]) if len(own) > 1 else None
+            others = [caster for caster in joints if caster not in targets]
+            if pooled is None or any(_speaks_against(joints[caster], pooled) for caster in others):
                 continue
             places = [locations[k] for k in own]
-            pooled = dataclasses.replace(pooled, term=dataclasses.replace(pooled.term, target=casters))
+            pooled = dataclasses.replace(pooled, term=dataclasses.replace(pooled.term, target=tuple(joints)))
             where = dataclasses.replace(
-                places[0], casters=casters, channels=tuple(name for place in places for name in place.channels)
+                places[0], casters=tuple(joints), channels=tuple(name for place in places for name in place.channels)
             )
             named = [_with_instance(pooled), *(entry for k, entry in enumerate(named) if k not in own)]
             locations = [where, *(place for k, place in enumerate(locations) if k not in own)]
-    return dataclasses.replace(found, named=tuple(named), locations=tuple(locations))
+            if others:
+                notes.append(
+                    f"{effect} shows in {axis} of {' and '.join(targets)}. In {' and '.join(others)} it hardly would, and "
+                    "nothing speaks against it there: that all have it is assumed of drives of one kind."
+                )
+    return dataclasses.replace(found, named=tuple(named), locations=tuple(locations), notes=tuple(notes))
+
+
+def _speaks_against(problem: RegressionProblem, named: NamedTerm) -> bool:
+    """Whether a joint did not do what it would have done with an effect that others have."""
+    term = next(term for term in problem.terms if term.effect == named.term.effect)
+    values = {name: estimate.value for name, estimate in named.estimates.items()}
+    shape = {name: values.get(name, value) for name, value in term.shapes[0].items()}
+    return _size(problem.residual - term.columns(shape)[:, :, 0]) > _size(problem.residual)
 
 
 def _pooled(named: Sequence[NamedTerm]) -> NamedTerm | None:

@@ -247,8 +247,9 @@ class LawSearch:
     ) -> bool:
         """Whether the law moves the prediction of some channel by more than details and misjudgements of the model.
 
-        These are the same at all times: what changes with the time may be a smaller part of what is measured. Against a name that it replaces it is enough to differ by a fair part of what the name does. That something is there
-        the name has shown; the model misjudges it by no more than it misjudges everything.
+        Against a name that it replaces it is enough to differ by a fair part of what the name does. That something is there
+        the name has shown; the model misjudges it by no more than it misjudges everything. Details are the same at all times:
+        what changes with the time may be a smaller part of what is measured.
         """
         after = predicted(problem, with_law)
         change, left = after - predicted(problem, without), problem.residual - after
