@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,17 @@ def test_location() -> None:
     assert figure(cases, 4, "patch centre, median error").value == pytest.approx(0.05)
     assert figure(cases, 4, "casters").of == "1 of 2 cases with a location, above the floor"
     assert figure(cases, 4, "region, median overlap").value == pytest.approx(0.75)  # 2/3, 3/4, 3/4
+
+
+def test_a_patch_is_as_wide_as_it_is_long_the_other_way_round() -> None:
+    """An outline is told with the longer side as its length; that it was drawn the other way is no error."""
+    drawn = {"x": 0.6, "y": 0.3, "length": 0.4, "width": 0.5, "yaw": 0.1, "roundness": 1.0, "factor": 0.5}
+    patch = concealed("low_friction_patch", parameters=drawn)
+    told = drawn | {"length": 0.5, "width": 0.4, "yaw": 0.1 - 0.5 * math.pi}
+    parameters = {name: {"value": value, "unit": "", "ci95": [value - 0.01, value + 0.01]} for name, value in told.items()}
+    errors = judged(answer("single", patch), report(named("low_friction_patch", parameters=parameters))).parameter_errors()
+    assert len(errors) == 7
+    assert all(error.covered and error.error < 1e-9 for error in errors)
 
 
 def test_numbers_and_their_intervals() -> None:

@@ -13,6 +13,7 @@ from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.explanation import named_terms
 from pcw_sim_bridge.mismatch.outline_search import OUTLINE, has_outline, searched_outline
 from pcw_sim_bridge.mismatch.regression_problem import Channel, LinearParameter, RegressionProblem, Term
+from pcw_sim_bridge.mismatch.shape_search import DROP
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
@@ -111,6 +112,22 @@ def test_where_few_wheels_crossed_a_patch_its_interval_holds_what_else_it_may_be
     found, true = (trial.evidence for trial in trials.tried([selection.fit.instances[0], shaped(outline)]))
     assert found > true - 2.0
     assert estimates["size"].low < 0.3 < estimates["size"].high
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_a_border_that_few_wheels_crossed_is_within_its_interval(seed):
+    """A search stays where it is best: of what does nearly as well further away it met some by chance, and told no others."""
+    rng = np.random.default_rng(seed)
+    length, width = np.sort(rng.uniform(0.5, 1.0, 2))[::-1]
+    outline = {"x": rng.uniform(-0.2, 0.2), "y": rng.uniform(-0.2, 0.2), "length": length, "width": width}
+    outline |= {"yaw": rng.uniform(-1.0, 1.0), "roundness": 1.0}
+    problem = floor_problem(tracks(6), outline, 0.3)
+    search = EffectSearch(problem, np.random.default_rng(0))
+    search.with_outlines(search.conclude((shaped(DISC),), 5.0))
+    ranges, _ = search.outlines[0].ranges(DROP)
+    for name in OUTLINE[:4]:
+        low, high = ranges[name]
+        assert low < outline[name] < high, name
 
 
 def test_a_patch_is_judged_in_its_own_outline_and_not_in_that_of_a_first_look():

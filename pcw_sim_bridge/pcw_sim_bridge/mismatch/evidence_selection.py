@@ -25,11 +25,11 @@ from pcw_description.effects.registry import all_effects
 from .effect_gates import EffectGates
 from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
 from .noise_model import SLOW_ORDINATES
-from .outline_search import Outlines, has_outline, searched_outline
+from .outline_search import Outlines, has_outline, reaching, searched_outline
 from .regression_problem import HEALTHY, FloatArray, RegressionProblem, segment_slices
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep, Progress, SetGrowth
-from .shape_search import refined_shape
+from .shape_search import DROP, refined_shape
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # Effects of so little less evidence [nats] are alike, and at most so many are tried; those of so much less are not looked at.
@@ -314,7 +314,17 @@ class EffectSearch(SetGrowth):
                 # Far from where the problem is exact a first order misjudges what a patch does.
                 if gain < ALIKE:
                     break
+            self._note_reach(selection, term)
         return selection
+
+    def _note_reach(self, selection: Selection, term: int) -> None:
+        """Note how far the outlines of a patch reach that do as well as the chosen one."""
+        instance = next((other for other in selection.fit.instances if other.term == term), None)
+        if instance is None or term not in self.outlines:
+            return
+        others = tuple(other for other in selection.fit.instances if other != instance)
+        regression = selection.regression.moved(self.problem.around(term, instance.shape))
+        self.outlines[term] = reaching(regression, others, instance, self.outlines[term], DROP)
 
     def _with_better_outline(self, selection: Selection, term: int) -> tuple[Selection, float]:
         """The selection with the best outline of a patch, and what that gains [nats]; 0 where it has it already."""

@@ -36,6 +36,7 @@ AS_GOOD = 1.0  # nats
 # The best outlines that are so many mean sides apart are followed downhill, from a simplex of this part of a side.
 FINALISTS, APART, SIMPLEX = 4, 0.3, 0.05
 EVALUATIONS, CLOSE_ENOUGH = 500, 0.05  # of a descent: at most, and [nats] to the end
+REACHING, OUTSIDE = 150, 1.0  # evaluations of a walk to the furthest that does as well; sides per nat that it is not worth
 WORST = 1e12  # instead of an outline that cannot be
 NARROWEST = 0.05  # [m], about a tyre's contact patch
 NEARLY = 3.0  # nats below the best that an outline of an earlier search may have been
@@ -98,6 +99,26 @@ def searched_outline(
     trials.spread([*reached, *(starts[k] for k in order)])
     trials.settle()
     return trials.best(), trials.all_tried()
+
+
+def reaching(
+    regression: WhitenedRegression, others: Sequence[Instance], instance: Instance, tried: Outlines, drop: float
+) -> Outlines:
+    """Return outlines that reach as far in every border as any does that is no more than this below the best [nats].
+
+    A search stays where it is best: those that do nearly as well further away it meets by chance only.
+
+    Args:
+        regression: where the problem is exact at the instance, beside the others.
+        tried: by a search before, under another fit.
+    """
+    trials = _Tried(ShapeTrials(regression, others, instance), instance)
+    near = tried.outlines[tried.evidence > tried.evidence.max() - drop]
+    furthest = [*near[:, :4].argmin(axis=0), *near[:, :4].argmax(axis=0)]
+    trials.evidence([*near[:: math.ceil(len(near) / MOST_BEFORE)], *near[furthest]])
+    for k, way in itertools.product(range(4), (-1.0, 1.0)):
+        trials.reach(k, way, drop)
+    return trials.all_tried()
 
 
 def _starts(own: FloatArray) -> list[FloatArray]:
@@ -175,7 +196,7 @@ class _Tried:
         """
         finalists: list[FloatArray] = []
         for key in sorted(self._known, key=lambda key: -self._known[key]):
-            outline = np.array(_upright(key))
+            outline = np.array(upright(key))
             side = 0.5 * float(outline[2] + outline[3])
             if all(np.abs(outline[:4] - other[:4]).sum() > APART * side for other in finalists):
                 finalists.append(outline)
@@ -190,19 +211,37 @@ class _Tried:
                          "adaptive": True},
             )  # fmt: skip
 
+    def reach(self, k: int, way: float, drop: float) -> None:
+        """Follow outlines within a drop of the best [nats] to where one number is smallest or largest; `way`: -1 or 1."""
+        best = max(self._known.values())
+        within = [np.array(key) for key, value in self._known.items() if value >= best - drop]
+        start = max(within, key=lambda outline: way * outline[k])
+        unit = 0.5 * np.array([*[start[2] + start[3]] * 4, 2.0, 2.0])
+
+        def cost(parts: FloatArray) -> float:
+            outline = _allowed(parts * unit)
+            lost = best - self.evidence([outline])[0]
+            return min(float(-way * outline[k] / unit[k]) + OUTSIDE * max(lost - drop, 0.0), WORST)
+
+        simplex = start / unit + np.vstack([np.zeros(6), SIMPLEX * np.eye(6)])
+        optimize.minimize(
+            cost, start / unit, method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": REACHING, "xatol": 1e-3, "fatol": 1e-3, "adaptive": True},
+        )  # fmt: skip
+
     def best(self) -> Instance:
         """The instance with the smallest of the best outlines: where nobody came there need not be any of it."""
         own = tuple(dict(self._instance.shape)[name] for name in OUTLINE)
         least = max(self._known.values()) - AS_GOOD
         key = min((key for key, value in self._known.items() if value >= least), key=lambda key: key[2] * key[3])
-        return self._instance if key == own else self._with(_upright(key))
+        return self._instance if key == own else self._with(upright(key))
 
     def all_tried(self) -> Outlines:
         """All that are not far below the best."""
         best = max(self._known.values())
         keys = [key for key, value in self._known.items() if value > best - FAR]
         return Outlines(
-            outlines=np.array([_upright(key) for key in keys]),
+            outlines=np.array([upright(key) for key in keys]),
             evidence=np.array([self._known[key] for key in keys]),
             coefficients=np.array([self._coefficients[key] for key in keys]),
         )
@@ -232,7 +271,7 @@ def _allowed(outline: FloatArray) -> FloatArray:
     return np.array([*outline[:2], *np.maximum(outline[2:4], NARROWEST), outline[4], np.clip(outline[5], 0.0, 1.0)])
 
 
-def _upright(outline: Sequence[float]) -> tuple[float, ...]:
+def upright(outline: Sequence[float]) -> tuple[float, ...]:
     """The same outline with the longer side as its length, and a direction from -pi/2 to pi/2."""
     x, y, length, width, yaw, roundness = outline
     if width > length:

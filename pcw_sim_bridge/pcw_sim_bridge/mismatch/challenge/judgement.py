@@ -10,6 +10,7 @@ from typing import Any
 
 from pcw_description.effects.registry import all_effects
 
+from ..outline_search import OUTLINE, upright
 from .cases import LEAST_SIZE, Answer, is_of_the_floor
 from .healthy_deviations import numbers_moved
 from .outside_effects import OUTSIDE_EFFECTS
@@ -138,7 +139,7 @@ class Judgement:
     def parameter_errors(self) -> list[ParameterError]:
         """Errors of the numbers of all effects that are named right, on their target."""
         found = []
-        for effect, key in zip(self.answer["effects"], self.truth, strict=True):
+        for effect, key in zip(map(_as_told, self.answer["effects"]), self.truth, strict=True):
             match = next((n for n in self.named if n.key == key), None)
             if match is None or effect["outside"] or len(match.entries) > 1:
                 continue
@@ -246,6 +247,15 @@ def _telling(effect: Mapping[str, Any]) -> list[tuple[str, float]]:
     ).parameters
     defaults = {p.name: p.default for p in declared}
     return [(name, value) for name, value in effect["parameters"].items() if value not in (defaults.get(name), 0.0)]
+
+
+def _as_told(effect: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The effect with the outline of a patch as reports tell it: one outline has one name."""
+    parameters = effect["parameters"]
+    if not set(OUTLINE) <= set(parameters):
+        return effect
+    told = upright([parameters[name] for name in OUTLINE])
+    return {**effect, "parameters": {**parameters, **dict(zip(OUTLINE, told, strict=True))}}
 
 
 def _error(effect: Mapping[str, Any], name: str, said: Mapping[str, Any], tuned_in: float) -> ParameterError:
