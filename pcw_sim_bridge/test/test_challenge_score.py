@@ -211,9 +211,9 @@ def test_location() -> None:
 
 def test_a_patch_is_as_wide_as_it_is_long_the_other_way_round() -> None:
     """An outline is told with the longer side as its length; that it was drawn the other way is no error."""
-    drawn = {"x": 0.6, "y": 0.3, "length": 0.4, "width": 0.5, "yaw": 0.1, "roundness": 1.0, "factor": 0.5}
+    drawn = {"x": 0.6, "y": 0.3, "length": 0.4, "width": 0.6, "yaw": 0.1, "roundness": 0.9, "factor": 0.5}
     patch = concealed("low_friction_patch", parameters=drawn)
-    told = drawn | {"length": 0.5, "width": 0.4, "yaw": 0.1 - 0.5 * math.pi}
+    told = drawn | {"length": 0.6, "width": 0.4, "yaw": 0.1 - 0.5 * math.pi}
     parameters = {name: {"value": value, "unit": "", "ci95": [value - 0.01, value + 0.01]} for name, value in told.items()}
     errors = judged(answer("single", patch), report(named("low_friction_patch", parameters=parameters))).parameter_errors()
     assert len(errors) == 7

@@ -11,7 +11,7 @@ import pytest
 from pcw_sim_bridge.mismatch.effect_gates import EffectGates
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.explanation import named_terms
-from pcw_sim_bridge.mismatch.outline_search import OUTLINE, has_outline, searched_outline
+from pcw_sim_bridge.mismatch.outline_search import OUTLINE, Outlines, has_outline, reaching, searched_outline
 from pcw_sim_bridge.mismatch.regression_problem import Channel, LinearParameter, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.shape_search import DROP
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
@@ -159,6 +159,8 @@ def test_no_outline_is_searched_for_a_patch_that_cannot_be():
     problem = dataclasses.replace(problem, terms=(dataclasses.replace(problem.terms[0], parameters=(positive,)),))
     regression = EffectSearch(problem, np.random.default_rng(0)).whiten_at(problem.residual)
     assert searched_outline(regression, (), shaped(DISC)) == (shaped(DISC), None)
+    before = Outlines(np.array([[DISC[name] for name in OUTLINE]]), np.zeros(1), np.zeros((1, 1)))
+    assert reaching(regression, (), shaped(DISC), before, DROP) is before
 
 
 def test_what_was_tried_is_told_upright():

@@ -115,7 +115,9 @@ def reaching(
     trials = _Tried(ShapeTrials(regression, others, instance), instance)
     near = tried.outlines[tried.evidence > tried.evidence.max() - drop]
     furthest = [*near[:, :4].argmin(axis=0), *near[:, :4].argmax(axis=0)]
-    trials.evidence([*near[:: math.ceil(len(near) / MOST_BEFORE)], *near[furthest]])
+    again = trials.evidence([*near[:: math.ceil(len(near) / MOST_BEFORE)], *near[furthest]])
+    if not math.isfinite(max(again)):  # the effect would have to be of a size that cannot be
+        return tried
     for k, way in itertools.product(range(4), (-1.0, 1.0)):
         trials.reach(k, way, drop)
     return trials.all_tried()
