@@ -131,7 +131,7 @@ def test_a_border_that_few_wheels_crossed_is_within_its_interval(seed):
 
 
 def test_a_patch_is_judged_in_its_own_outline_and_not_in_that_of_a_first_look():
-    """A disc at one end of a strip leaves more beside it than it explains: so a patch of 2800 nats was dropped."""
+    """A disc in the middle of a strip leaves more beside it than it explains: so a patch of 2800 nats was dropped."""
     strip = {"x": 0.1, "y": 0.0, "length": 1.5, "width": 0.3, "yaw": 0.8, "roundness": 0.0}
     problem = floor_problem(tracks(32), strip, 0.3)
     disc = shaped(DISC | {"x": 0.1, "y": 0.0})
