@@ -385,6 +385,18 @@ class RobotDescription:
         return _constant(matrices)
 
     @cached_property
+    def felt_inertia(self) -> FloatArray:
+        """Inertia that each joint feels when the robot's mass is shared by all casters, (n, 2) [kg m^2]."""
+        levers = [[c.wheel_radius, c.caster_offset[0]] for c in self.casters]
+        return _constant(self.own_inertia + self.total_mass / self.n * np.square(levers))
+
+    @cached_property
+    def own_inertia(self) -> FloatArray:
+        """Inertia of each joint alone, as it turns where tyres slip: of rotor, wheel, module, (n, 2) [kg m^2]."""
+        turned = [[c.wheel.inertia_axle, c.module.inertia_zz] for c in self.casters]
+        return _constant(self.armature[:, [DRIVE, STEER], [DRIVE, STEER]] + np.array(turned))
+
+    @cached_property
     def torque_limit(self) -> FloatArray:
         """Largest joint torques, (n, 2) [N m]."""
         return _constant([[c.limits.drive_torque, c.limits.steer_torque] for c in self.casters])

@@ -12,13 +12,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
+from pcw_description.robot_description import FloatArray, RobotDescription
 
 from .plants.plant import Plant, PlantError, PlantState
 from .plants.true_robot import as_it_really_is
 from .sensors import Encoders, Imu, ImuReading, JointReading, read_tracker
 
 NANOSECONDS = 1_000_000_000
+LARGEST_LOOP_STEP = 0.5  # of a speed error that a loop takes from a wheel that slips within one of its steps
 DEFAULT_TRUTH_RATE = 100.0  # [Hz], of a robot file without a tracker
 
 
@@ -72,18 +73,17 @@ class Sample:
 class VelocityLoops:
     """The velocity loop of every drive: proportional and integral, both poles at `bandwidth`.
 
-    Each joint is designed for on its own, with the inertia that it feels when the robot's mass is shared by all casters.
+    Each joint is designed for on its own, with the inertia that it feels when the robot's mass is shared by all casters; and
+    no faster than a loop with steps of `dt` may be where the tyre slips and leaves it the wheel alone: beyond, wheels shake.
     """
 
-    def __init__(self, robot: RobotDescription, bandwidth: float) -> None:
-        share = robot.total_mass / robot.n
-        inertia = robot.armature[:, [DRIVE, STEER], [DRIVE, STEER]].copy()
-        inertia[:, DRIVE] += [share * c.wheel_radius**2 + c.wheel.inertia_axle for c in robot.casters]
-        inertia[:, STEER] += [share * c.caster_offset[0] ** 2 + c.module.inertia_zz for c in robot.casters]
-        self._damping = 2.0 * bandwidth * inertia
-        self._stiffness = bandwidth**2 * inertia
+    def __init__(self, robot: RobotDescription, bandwidth: float, dt: float) -> None:
+        allowed = LARGEST_LOOP_STEP * robot.own_inertia / (2.0 * robot.felt_inertia * dt)
+        poles = np.minimum(bandwidth, allowed)
+        self._damping = 2.0 * poles * robot.felt_inertia
+        self._stiffness = poles**2 * robot.felt_inertia
         self._limit = robot.torque_limit
-        self._integral = np.zeros_like(inertia)
+        self._integral = np.zeros_like(robot.felt_inertia)
 
     def reset(self) -> None:
         """Forget the integral."""
@@ -105,7 +105,7 @@ class SimulatedRobot:
         seed: seed of all sensor noise.
         velocity_source: see `sensors.Encoders`.
         command_timeout: without a new command for so long, simulated time, the torque is zero [s].
-        velocity_bandwidth: of the drives' velocity loops [rad/s].
+        velocity_bandwidth: of the drives' velocity loops, at most [rad/s].
 
     Raises:
         PlantError: a sensor is faster than the plant's step.
@@ -127,7 +127,7 @@ class SimulatedRobot:
         self._step_ns = round(plant.dt * NANOSECONDS)
         self._encoders = Encoders(robot, velocity_source)
         self._imu = Imu(as_it_really_is(robot)) if sensors.imu else None
-        self._loops = VelocityLoops(robot, velocity_bandwidth)
+        self._loops = VelocityLoops(robot, velocity_bandwidth, plant.dt)
         self._control = _Schedule("sensors.encoders.rate", sensors.encoders.rate, plant.dt)
         truth_rate = sensors.tracker.rate if sensors.tracker else DEFAULT_TRUTH_RATE
         self._truth = _Schedule("sensors.tracker.rate", truth_rate, plant.dt)

@@ -132,7 +132,7 @@ def test_rotors_of_coupled_gears_are_wrong_at_both_joints(rotor: str) -> None:
     assert robot.armature[0, 0, 1] != 0.0
     differences = SimpleNamespace(
         model=SimpleNamespace(layout=ChannelLayout(robot.caster_names, True, False, True), numbers=ModelNumbers.of(robot)),
-        motions=[SimpleNamespace(sampling=0.004)],
+        motions=[SimpleNamespace(sampling=0.004, loops=np.zeros((1, robot.n, 2, 2)))],
     )
     [number] = [n for n in varied_numbers(robot, differences) if n.label == f"rotors.{rotor}"]  # type: ignore[arg-type]
     varied = ModelNumbers.of(robot)

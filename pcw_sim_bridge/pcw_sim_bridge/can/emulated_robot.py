@@ -79,7 +79,7 @@ class EmulatedRobot:
         self._steps = 0
         self._rng = np.random.default_rng(seed)
         self._encoders = Encoders(robot)
-        self._loops = VelocityLoops(robot, 30.0)
+        self._loops = VelocityLoops(robot, 30.0, plant.dt)
         watch = file.timeouts.watchdog if watchdog is None else watchdog
         self.drives: list[EmulatedDrive] = []
         self.sign = np.ones((robot.n, 2))

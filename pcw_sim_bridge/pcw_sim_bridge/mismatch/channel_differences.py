@@ -99,20 +99,27 @@ class ChannelDifferences:
         Returns:
             (T, C, K), per unit of each of the K torques.
         """
+        parts = []
+        for start in range(0, torques[0].shape[3], TORQUES_AT_ONCE):
+            some = slice(start, start + TORQUES_AT_ONCE)
+            pairs = zip(self._torque_responses(), self.known, torques, strict=True)
+            parts.append(
+                self.filtered([np.where(known[:, :, None], -r.apply(t[..., some]), 0.0) for r, known, t in pairs])
+            )
+        return np.concatenate(parts, axis=2)
+
+    def wrench_of_torque(self) -> list[FloatArray]:
+        """What torques on the joints add to force and moment along each motion, (T, 3, n, 2)."""
+        return [response.wrench_of_torque for response in self._torque_responses()]
+
+    def _torque_responses(self) -> list[TorqueResponse]:
         if self._responses is None:
             self._responses = [
                 TorqueResponse(motion, self.model.numbers, self.model.layout, state, around.straight)
                 for motion, state, around in zip(self.motions, self._states, self._around, strict=True)
                 if around.straight is not None
             ]
-        parts = []
-        for start in range(0, torques[0].shape[3], TORQUES_AT_ONCE):
-            some = slice(start, start + TORQUES_AT_ONCE)
-            pairs = zip(self._responses, self.known, torques, strict=True)
-            parts.append(
-                self.filtered([np.where(known[:, :, None], -r.apply(t[..., some]), 0.0) for r, known, t in pairs])
-            )
-        return np.concatenate(parts, axis=2)
+        return self._responses
 
     def of_unit_torque(self, i: int, axis: int) -> FloatArray:
         """What a constant torque at one joint adds to the residual (T, C), per N m."""

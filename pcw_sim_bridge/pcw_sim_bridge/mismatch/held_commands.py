@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from pcw_description.recording import Recording
 from pcw_description.robot_description import RobotDescription
 
-from .regression_problem import FloatArray
+from .regression_problem import BoolArray, FloatArray
 
 SAME_STAMP = 1e-6  # [s]
 # Where stamps tremble, a command and a state are of the same time that are nearer than this part of the shorter interval.
@@ -16,6 +17,10 @@ LARGEST_GAP = 0.05  # [s]; an older command is not held any more
 # A motor follows its commands where what it reports is so many times the command.
 FOLLOWS = (0.8, 1.2)
 SURE = 5.0  # deviations of chance, by which one way to read the stamps must be nearer to what was reported than another
+NOISE_BANDS = 10  # of all frequencies; the quietest holds no more than the noise
+# Of a periodogram that are averaged: few enough to see a motion, enough to see that there is none; and by how many deviations
+# of chance they have to be more than noise.
+SMOOTHED_ORDINATES, SURE_POWER = 25, 3.0
 
 
 def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray | None:
@@ -48,20 +53,59 @@ def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray |
     return found
 
 
-def quiet_torque(robot: RobotDescription, recording: Recording) -> FloatArray | None:
-    """Return the motors' torques (T, n, 2) [N m] without the noise of their measurement where that can be had.
+def held_speeds(recording: Recording) -> FloatArray:
+    """Return the speed that every joint was last commanded to hold at each stamp (T, n, 2) [rad/s]; NaN where none was."""
+    commands, joints = recording.joint_commands, recording.joint_states
+    if commands is None or commands.velocity is None or len(commands.stamp) < 2:
+        return np.full_like(joints.position, np.nan)
+    last = np.searchsorted(commands.stamp, joints.stamp - SAME_STAMP, side="left") - 1
+    fresh = (last >= 0) & (joints.stamp - commands.stamp[np.maximum(last, 0)] < LARGEST_GAP)
+    return np.where(fresh[:, None, None], commands.velocity[np.maximum(last, 0)], np.nan)
 
-    It can where a motor follows its commands; elsewhere the torque is as it was reported. None where none was reported.
+
+def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatArray, BoolArray] | None:
+    """Return the motors' torques with as little of the noise of their measurement as can be had; None if none was reported.
+
+    Where a motor follows its commands that is the command; elsewhere what was reported, see `expected`.
 
     An effect that is a function of the reported torque would hold the very noise that the residual holds, and be found as
     small, or as large, as makes that noise least.
+
+    Returns:
+        Torques (T, n, 2) [N m], and of which joints they are reported ones (n, 2).
     """
     reported, commanded = recording.joint_states.effort, held_commands(robot, recording)
-    if reported is None or commanded is None:
-        return reported
-    both = np.isfinite(reported) & np.isfinite(commanded)
-    product = np.sum(np.where(both, reported * commanded, 0.0), axis=0)
-    slope = product / np.maximum(np.sum(np.where(both, commanded**2, 0.0), axis=0), 1e-300)
-    follows = (slope > FOLLOWS[0]) & (slope < FOLLOWS[1])
-    quiet: FloatArray = np.where(both & follows, commanded, reported)
-    return quiet
+    if reported is None:
+        return None
+    quiet, follows = reported.copy(), np.zeros(reported.shape[1:], dtype=bool)
+    if commanded is not None:
+        both = np.isfinite(reported) & np.isfinite(commanded)
+        product = np.sum(np.where(both, reported * commanded, 0.0), axis=0)
+        slope = product / np.maximum(np.sum(np.where(both, commanded**2, 0.0), axis=0), 1e-300)
+        follows = (slope > FOLLOWS[0]) & (slope < FOLLOWS[1])
+        quiet = np.where(both & follows, commanded, reported)
+    for i, axis in np.argwhere(~follows):
+        quiet[:, i, axis] = expected(reported[:, i, axis])
+    return quiet, ~follows
+
+
+def expected(values: FloatArray) -> FloatArray:
+    """Return what a signal (T,) in white noise is expected to be without it, NaN where it is NaN.
+
+    The part of each frequency that is not noise, by Wiener's filter; the noise is no more than what the quietest frequencies
+    hold. What is regressed on it comes out in its true size, where on the signal as it is it would come out too
+    small by the noise's part: Carroll et al., Measurement Error in Nonlinear Models, 2nd ed. (2006), chapter 4.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) < 10 * SMOOTHED_ORDINATES:
+        return values
+    rows = np.arange(len(values))
+    whole = np.interp(rows, known, values[known])
+    mirrored = np.concatenate([whole, whole[::-1]])  # without a step at the ends
+    spectrum = np.fft.rfft(mirrored)
+    power = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, SMOOTHED_ORDINATES, mode="nearest")
+    noise = min(float(np.median(band)) for band in np.array_split(power, NOISE_BANDS))
+    by_chance = 1.0 + SURE_POWER / np.sqrt(SMOOTHED_ORDINATES)
+    share = np.where(power > by_chance * noise, 1.0 - noise / np.maximum(power, 1e-300), 0.0)
+    quiet: FloatArray = np.fft.irfft(spectrum * share, len(mirrored))[: len(values)]
+    return np.where(np.isfinite(values), quiet, np.nan)

@@ -40,6 +40,7 @@ from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
 from .signal_filter import SignalFilter
 from .sudden_slip import sudden_slip
+from .torque_errors import with_balanced_torques
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
 SLIP_FLOOR, SLIP_PART = 0.03, 0.75
@@ -111,8 +112,13 @@ class RobotProblemBuilder:
             with_terms: False leaves out candidate effects: residual and tolerances alone are many times cheaper.
         """
         differences = ChannelDifferences(self.model, self.motions, self.filters)
-        along = self._along_motions(differences)
         valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
+        if with_terms and self.layout.balanced and any(motion.reported.any() for motion in self._read):
+            self._read = with_balanced_torques(self._read, differences, valid, nuisances)
+            self.motions = self._motions_of(self.model)
+            differences = ChannelDifferences(self.model, self.motions, self.filters)
+            nuisances = tuple(robot_nuisances(self.robot, differences))
+        along = self._along_motions(differences)
         stamps = [f.decimate(m.time) for f, m in zip(self.filters, self.motions, strict=True)]
         time = np.concatenate(stamps)
         segment = np.concatenate([np.full(len(t), i) for i, t in enumerate(stamps)])
@@ -279,7 +285,7 @@ class RobotProblemBuilder:
                 signals[f"drive_normal_force/{caster}"] = normal[:, i]
                 for axis, axis_name in enumerate(AXIS_NAMES):
                     signals[f"{axis_name}_velocity/{caster}"] = motion.velocity[:, i, axis]
-                    signals[f"{axis_name}_torque/{caster}"] = motion.quiet_torque[:, i, axis]
+                    signals[f"{axis_name}_torque/{caster}"] = motion.balanced_torque[:, i, axis]
             for name, values in signals.items():
                 found.setdefault(name, []).append(np.ascontiguousarray(values))
         return found

@@ -300,7 +300,7 @@ class ChannelModel:
             axis = AXIS_NAMES.index(instance.axis or effect.axis)
             for name in instance.target:
                 i = self.robot.caster_index(name)
-                position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.quiet_torque))
+                position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.balanced_torque))
                 if axis == STEER:  # of the heading, whatever is read of it
                     position = self.numbers.headings(motion.position)[:, i]
                 torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)

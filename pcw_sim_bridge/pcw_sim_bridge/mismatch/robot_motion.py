@@ -12,7 +12,7 @@ from scipy import signal
 from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
 
-from .held_commands import quiet_torque
+from .held_commands import held_speeds, quiet_torque
 from .regression_problem import BoolArray, FloatArray
 from .signal_filter import SignalFilter, derivative, interpolated, uniform_segments, white_noise_level
 from .wheel_shaking import wheel_shaking
@@ -44,7 +44,14 @@ class RobotMotion:
         rate: [Hz]; cutoff: of the wide filter [Hz].
         sampling: interval of joint_states [s].
         position, velocity, acceleration, torque: joints (T, n, 2).
-        quiet_torque: the torque without the noise of its measurement, where that can be had (T, n, 2); torque_rate: its rate.
+        quiet_torque: the torque without the noise of its measurement, as far as that can be had (T, n, 2); torque_rate: its
+            rate.
+        reported: joints of which that is a measured torque (n, 2).
+        balanced_torque: the quiet torque without the errors that the balance of forces shows of it (T, n, 2), see
+            `torque_errors`: what effects are functions of. What makes wheels slip is the quiet one: no balance tells which
+            wheel a force acts at.
+        loops: of drives that hold commanded speeds by loops of their own (T, n, 2, 2): what accelerates their joints [N m],
+            and what would within a second if they were behind their speeds [N m s]; zero elsewhere.
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
@@ -61,7 +68,10 @@ class RobotMotion:
     acceleration: FloatArray
     torque: FloatArray
     quiet_torque: FloatArray
+    reported: BoolArray
+    balanced_torque: FloatArray
     torque_rate: FloatArray
+    loops: FloatArray
     imu: FloatArray
     pose: FloatArray
     tracked_twist: FloatArray
@@ -90,10 +100,10 @@ def read_motions(
     n = robot.n
     torque = joints.effort if joints.effort is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([joints.position.reshape(-1, 2 * n), torque.reshape(-1, 2 * n)], axis=1)
-    quiet = quiet_torque(robot, recording)
-    quiet = torque if quiet is None else quiet
+    quiet, reported = quiet_torque(robot, recording) or (torque, np.ones((n, 2), dtype=bool))
+    wanted = held_speeds(recording)
     speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
-    signals = np.concatenate([signals, quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n)], axis=1)
+    signals = np.concatenate([signals, quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n), wanted.reshape(-1, 2 * n)], axis=1)
     rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
     step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
@@ -108,6 +118,11 @@ def read_motions(
             smooth = wide.smooth(_bridged(block))
             position = smooth[:, : 2 * n].reshape(-1, n, 2)
             velocity = derivative(position, rate)
+            acceleration = derivative(velocity, rate)
+            loops = np.zeros((*velocity.shape, 2))
+            if np.isfinite(block[:, -2 * n :]).any():
+                behind = smooth[:, -2 * n :].reshape(velocity.shape) - velocity
+                loops = robot.felt_inertia[:, :, None] * np.stack([acceleration, behind], axis=3)
             torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
             quiet = smooth[:, 4 * n + 6 : 6 * n + 6].reshape(-1, n, 2)
             keep = slice(None, None, step)
@@ -116,7 +131,7 @@ def read_motions(
             pose = sensed[:, 3:]
             measured_torque = block[:, 2 * n : 4 * n].reshape(-1, n, 2)
             shaking = wheel_shaking(
-                robot, block[:, : 2 * n].reshape(-1, n, 2), block[:, -2 * n :].reshape(-1, n, 2), measured_torque, wide
+                robot, block[:, : 2 * n].reshape(-1, n, 2), block[:, -4 * n : -2 * n].reshape(-1, n, 2), measured_torque, wide
             )
             motions.append(
                 RobotMotion(
@@ -127,10 +142,13 @@ def read_motions(
                     time=stamps[start:stop][keep].copy(),
                     position=position[keep].copy(),
                     velocity=velocity[keep].copy(),
-                    acceleration=derivative(velocity, rate)[keep].copy(),
+                    acceleration=acceleration[keep].copy(),
                     torque=torque[keep].copy(),
                     quiet_torque=quiet[keep].copy(),
+                    reported=reported,
+                    balanced_torque=quiet[keep].copy(),
                     torque_rate=derivative(quiet, rate)[keep].copy(),
+                    loops=loops[keep].copy(),
                     imu=sensed[keep, :3],
                     pose=base_pose(robot, pose[keep]),
                     tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),

@@ -28,6 +28,8 @@ FARTHEST = 4.0
 MODEL_DEVIATION = 0.007
 INERTIAS = ("module.", "wheel.inertia", "rotors.")  # of numbers in whose place the model's own errors come
 FLOOR = ("ground.slope.x", "ground.slope.y")
+# [rad/s]; of the velocity loops of drives, and the largest part of their torque that their reports may lack.
+LOOP_BANDWIDTH, LARGEST_UNREPORTED = 50.0, 0.3
 FREQUENCY_DEVIATION = 0.2  # of the chassis on its springs, relative
 
 
@@ -82,6 +84,7 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
     if layout.balanced:
         # A drive reports the torque of some instant within its own cycle; nobody knows which.
         found.append(VariedNumber("torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
+        found += _unreported(differences)
     found += _suspension(differences)
     deviations = list(_geometry(robot))
     if layout.balanced:
@@ -195,6 +198,24 @@ def _suspension(differences: ChannelDifferences) -> list[VariedNumber]:
             if layout.imu:
                 found.append(VariedNumber(f"imu.lean.{axis}", "s^2", 0.0, lean, _entry("imu_lean", k)))
     return found
+
+
+def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
+    """What a drive that holds speeds does not report of its torque: parts that nobody knows.
+
+    Its torque leaps with every commanded speed, 2 w J (speed it is behind), and fades as the joint follows, while its integral
+    grows, w^2 J times the same. Read once a cycle h, always at the same place of it, it differs from its mean by up to w h of
+    what accelerates the joint, and the other way by w^2 h / 2 for each second that it is behind.
+    """
+    motions = [motion for motion in differences.motions if np.any(motion.loops)]
+    if not motions:
+        return
+    part = min(LOOP_BANDWIDTH * max(motion.sampling for motion in motions), LARGEST_UNREPORTED)
+    for axis, name in enumerate(AXIS_NAMES):
+        yield VariedNumber(f"torque_report.{name}", "1", 0.0, part, _entry("unreported", (axis, 0)))
+        yield VariedNumber(
+            f"torque_report.{name}_behind", "1/s", 0.0, 0.5 * LOOP_BANDWIDTH * part, _entry("unreported", (axis, 1))
+        )
 
 
 def _geometry(robot: RobotDescription) -> Iterator[Deviation]:

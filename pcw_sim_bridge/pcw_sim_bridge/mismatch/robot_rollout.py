@@ -158,18 +158,24 @@ def _squares(difference: FloatArray) -> FloatArray:
 # -- simulating -----------------------------------------------------------------------------------------------------
 
 
-def rollout_squares(robot: RobotDescription, windows: Windows) -> FloatArray:
-    """Squared errors (W, H, S) of a robot's model over windows."""
+def rollout_squares(robot: RobotDescription, windows: Windows, unreported: FloatArray) -> FloatArray:
+    """Squared errors (W, H, S) of a robot's model over windows.
+
+    Args:
+        robot: the model.
+        windows: of its recordings.
+        unreported: of the torques of its drives, see `ModelNumbers` (2, 2).
+    """
     found = []
     for part in windows.parts:
         ends, _ = part.ends()
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
-        found.append(_squares(_simulated(robot, part) - seen))
+        found.append(_squares(_simulated(robot, part, unreported) - seen))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
 def rollout_floor(
-    robot: RobotDescription, windows: Windows, rng: np.random.Generator
+    robot: RobotDescription, windows: Windows, unreported: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """Squared errors (W, H, S) that the noise of the sensors makes in a model that is right.
 
@@ -181,8 +187,8 @@ def rollout_floor(
         noisy, path = _with_noise(part, rng), part.path + rng.standard_normal(part.path.shape) * part.noise[2]
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
         seen_again = _signals(part, noisy.position, noisy.velocity, path)[ends]
-        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path))
-        found.append(_squares(moved - _simulated(robot, part) - (seen_again - seen)))
+        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path), unreported)
+        found.append(_squares(moved - _simulated(robot, part, unreported) - (seen_again - seen)))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
@@ -202,7 +208,7 @@ def _with_noise(part: RobotPart, rng: np.random.Generator) -> RobotMotion:
     )
 
 
-def _simulated(robot: RobotDescription, part: RobotPart) -> FloatArray:
+def _simulated(robot: RobotDescription, part: RobotPart, unreported: FloatArray) -> FloatArray:
     """Signals (W, H, 2n + 6) that the robot's own sensors would give at the horizons."""
     motion = true_motion(robot, part.motion)
     own = ModelNumbers.of(as_it_really_is(robot))
@@ -218,7 +224,8 @@ def _simulated(robot: RobotDescription, part: RobotPart) -> FloatArray:
         motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first]
     )
     # A row is held until the next: what acts meanwhile is the mean of both.
-    torque = 0.5 * (motion.torque[rows] + motion.torque[np.minimum(rows + 1, len(motion.time) - 1)])
+    given = motion.torque + np.sum(unreported * motion.loops, axis=3)
+    torque = 0.5 * (given[rows] + given[np.minimum(rows + 1, len(motion.time) - 1)])
     bodies, joints = plant.roll_out(torque, substeps, starts, lead, part.marks)
     position, velocity = _read(robot, joints[..., 0, :], joints[..., 1, :])
     return _signals(part, position, velocity, bodies[..., :3])

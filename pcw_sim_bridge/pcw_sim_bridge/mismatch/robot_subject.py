@@ -51,6 +51,7 @@ class RobotSubject:
         self.robot = robot
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
+        self._unreported = np.zeros((2, 2))  # see ModelNumbers
         self._missing: tuple[str, ...] = ()
         self._sensors: tuple[Path, tuple[bool, bool]] | None = None
 
@@ -145,6 +146,9 @@ class RobotSubject:
         robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
         subject = RobotSubject(retuned_robot(robot, retuned))
         subject._cutoff = self._cutoff
+        subject._unreported = np.array(
+            [[retuned.get(f"torque_report.{axis}{kind}", 0.0) for kind in ("", "_behind")] for axis in AXIS_NAMES]
+        )
         return subject
 
     def mapping(self) -> dict[str, Any]:
@@ -184,11 +188,11 @@ class RobotSubject:
 
     def rollout(self, windows: Windows) -> FloatArray:
         """Return the squared errors of the reduced plant under the measured torques, (W, H, S)."""
-        return rollout_squares(self.robot, windows)
+        return rollout_squares(self.robot, windows, self._unreported)
 
     def rollout_floor(self, windows: Windows, rng: np.random.Generator) -> FloatArray:
         """Return the squared errors that the noise of the sensors makes in it, (W, H, S)."""
-        return rollout_floor(self.robot, windows, rng)
+        return rollout_floor(self.robot, windows, self._unreported, rng)
 
 
 def _missing_casters(robot: RobotDescription, recording: Recording) -> tuple[str, ...]:

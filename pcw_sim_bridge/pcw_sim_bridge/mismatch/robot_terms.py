@@ -137,7 +137,8 @@ class _TermMaker:
         for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
             found = np.zeros((*motion.position.shape, len(effect.linear_parameters)))
             for i in casters:
-                position, velocity, force = (s[:, i, column] for s in (motion.position, motion.velocity, motion.quiet_torque))
+                signals = motion.position, motion.velocity, motion.balanced_torque
+                position, velocity, force = (s[:, i, column] for s in signals)
                 by_name = effect.regressor(position, velocity, force, normal[:, i], shape)
                 found[:, i, column] = np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1)
             torques.append(found)

@@ -211,6 +211,8 @@ class ModelNumbers:
         tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
         tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
+        unreported: how much of each kind of `loops` the joints were given more than drives that hold speeds report, drives and
+            steerings (2, 2) [1], [1/s].
         heading_lead: how much later the headings were that belong to the rates beside them [s]. A simulation in steps that
             makes its rates from one set of angles, and the next angles from those rates, is half a step off.
         clock: how much later than the joints' the stamps of IMU and tracker are (2,) [s].
@@ -240,6 +242,7 @@ class ModelNumbers:
     tyres: FloatArray
     softness: FloatArray
     torque_lag: float
+    unreported: FloatArray
     heading_lead: float
     clock: FloatArray
     spring: float
@@ -286,6 +289,7 @@ class ModelNumbers:
             tyres=np.array([tyre_parameters(tyre) for tyre in (*robot.tyres, *(robot.contact for _ in robot.fixed_axle))]),
             softness=np.ones((robot.n + len(robot.fixed_axle), 2)),
             torque_lag=0.0,
+            unreported=np.zeros((2, 2)),
             heading_lead=0.0,
             clock=np.zeros(2),
             spring=robot.wheel_suspension.stiffness,
@@ -718,7 +722,8 @@ def rolling_state(
         # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads
         # of tyres, would be found as small, or as large, as makes that noise least.
         added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
-        added += (numbers.gain - 1.0) * motion.quiet_torque + numbers.torque_lag * motion.torque_rate
+        added += (numbers.gain - 1.0) * motion.balanced_torque + numbers.torque_lag * motion.torque_rate
+        added += np.sum(numbers.unreported * motion.loops, axis=3)
         if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
             added[:, :, DRIVE] += radius * around.climb[:, :, 0]
         load, force = (

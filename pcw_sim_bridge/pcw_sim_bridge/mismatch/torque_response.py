@@ -59,6 +59,12 @@ class TorqueResponse:
         self._imu_position, self._twist = numbers.imu_position, state.twist
         self._imu_scale = np.array([numbers.gyro_scale, *numbers.accelerometer_scale])
 
+    @property
+    def wrench_of_torque(self) -> FloatArray:
+        """What torques on the joints add to force and moment (T, 3, n, 2)."""
+        count, _, joints = self._wrench_of_torque.shape
+        return self._wrench_of_torque.reshape(count, 3, joints // 2, 2)
+
     def apply(self, torque: FloatArray) -> FloatArray:
         """Return what torques (T, n, 2, K) [N m] change in measured minus predicted channels (T, C, K)."""
         count, n, _, width = torque.shape
