@@ -114,6 +114,22 @@ def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object
         assert values["factor"] == pytest.approx(0.3, rel=0.2)
 
 
+def test_other_waves_are_asked_beside_what_was_found(tmp_path: Path) -> None:
+    """From waves that do nearly as well no search leads to those that are there: other ones have to be tried again."""
+    entry = {"name": "uneven_ground", "target": CASTERS, "amplitude": 0.001, "wavelength": 1.9, "direction": 2.6}
+    true = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
+    excitation = make_excitation("chirps", THESIS, 30.0, 4)
+    record_run(true, excitation.twist, excitation.duration, 4, tmp_path / "run", "reduced", controlled_as=THESIS)
+    problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / "run", THESIS)]).build()
+    search = EffectSearch(problem, np.random.default_rng(0))
+    term = next(k for k, term in enumerate(problem.terms) if term.effect == "uneven_ground")
+    elsewhere = dict(problem.terms[term].shapes[0]) | {"wavelength": 0.8, "direction": 0.5}
+    wrong = search.conclude((Instance(term, tuple(sorted(elsewhere.items())), (0,)),), 5.0)
+    [found] = search.with_best_waves(wrong).fit.instances
+    assert dict(found.shape)["wavelength"] == pytest.approx(1.9, rel=0.1)
+    assert math.cos(2.0 * (dict(found.shape)["direction"] - 2.6)) > 0.98  # half a turn on the floor is the same
+
+
 @pytest.mark.parametrize("again", [True, False])
 def test_a_push_is_proved_on_held_out_data_only_if_it_comes_there_too(again: bool, tmp_path: Path) -> None:
     """At the same time, as where somebody staged it; a recording without a push proves nothing, and is not made worse."""

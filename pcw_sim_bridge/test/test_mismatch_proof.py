@@ -22,6 +22,7 @@ from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm, explain
 from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
 from pcw_sim_bridge.mismatch.generated_effect import NoSuchKernelError
+from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.open_set import Leftover
@@ -365,9 +366,50 @@ def test_effects_that_only_make_up_for_numbers_far_off_are_no_patch(size: float,
         _is_patched=lambda explanation: True,
         _error=lambda explanation, held_out, predicted: float(np.mean((held_out.problem.residual - predicted) ** 2)),
     )
+    prover.tuned = Prover._numbers_help(prover, SimpleNamespace(), held_out, None)  # type: ignore[arg-type]
+    prover._prediction = functools.partial(Prover._prediction, prover)
     found = Prover._no_better(prover, SimpleNamespace(), held_out)  # type: ignore[arg-type]
+    assert not prover.tuned
     assert (found is None) == stays
     assert found is None or found[0] == 0
+
+
+@pytest.mark.parametrize("astray", [False, True])
+def test_an_effect_is_no_patch_without_numbers_that_it_needs(astray: bool) -> None:
+    """More than twice of what is missing, and a number that takes the rest back, but leads simulations astray."""
+    true = np.sin(np.arange(400.0))[:, None]
+    held_out = SimpleNamespace(
+        proposed=(0,), instances=(Instance(0, (), (0,)),), nuisances=1,
+        problem=SimpleNamespace(residual=true, nominal_residual=true),
+        means=lambda: np.array([[-1.2, 2.2]]), predicted=lambda means: true * means.sum(), help_of=lambda index: (40.0, 50.0),
+    )
+    prover = SimpleNamespace(
+        _is_patched=lambda explanation: True, _simulates_worse=lambda explanation, after: astray,
+        _error=lambda explanation, held_out, predicted: float(np.mean((held_out.problem.residual - predicted) ** 2)),
+    )
+    prover.tuned = Prover._numbers_help(prover, SimpleNamespace(), held_out, None)  # type: ignore[arg-type]
+    prover._prediction = functools.partial(Prover._prediction, prover)
+    assert prover.tuned is not astray
+    assert (Prover._no_better(prover, SimpleNamespace(), held_out) is not None) is astray  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("part", "speaks_for_it"), [(1.0, True), (0.4, True), (0.1, False)])
+def test_held_out_data_contradict_an_effect_of_which_hardly_a_part_is_there(part: float, speaks_for_it: bool) -> None:
+    """Fitted, a number does the same as the effect, and without it all of it; held out that number does something else.
+
+    A scrub radius that was right was refused: beside numbers a little off, a little less than half of it would have been best.
+    """
+    weight = 200.0
+    fitted = np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])  # of number, effect and residual
+    judged = np.array([[0.0, 2.0], [1.0, 0.0], [part, 0.0]])
+    held_out = HeldOut(
+        problem=SimpleNamespace(), instances=(Instance(0, (), (0,)),), proposed=(0,), columns=np.zeros((0, 0, 0)),
+        fold=np.zeros(0, dtype=np.int64), train=weight * (fitted @ fitted.T)[None], test=weight * (judged @ judged.T)[None],
+        deviations=np.array([1.0, 10.0]), nuisances=1, healthy=np.array([3.0]), source="",
+    )  # fmt: skip
+    nats, work = held_out.help_of(0)
+    assert work == pytest.approx(0.5 * weight, rel=0.05)
+    assert (nats > 0.0) is speaks_for_it
 
 
 @pytest.mark.parametrize(
@@ -398,6 +440,7 @@ def test_a_small_law_that_other_data_contradict_is_no_finding(
         _useless=lambda explanation, held_out: says(prover, "errors"),
         _misleading=lambda explanation, held_out, after: says(prover, "simulation"),
         _no_better=lambda explanation, held_out: None, _is_patched=lambda explanation: False,
+        _numbers_help=lambda explanation, held_out, after: True,
         _remarks=lambda *rest: [], _finding=lambda *rest: None, tuned=True,
     )
     monkeypatch.setattr(proof, "_of_description", lambda problem: np.zeros(1))

@@ -16,7 +16,7 @@ from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, STEER
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.findings import Findings
-from pcw_sim_bridge.mismatch.held_commands import expected
+from pcw_sim_bridge.mismatch.held_commands import expected, held_commands, quiet_torque
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.signal_filter import SignalFilter
@@ -66,6 +66,28 @@ def test_what_is_expected_of_a_signal_without_noise_is_that_signal() -> None:
     assert np.std(expected(signal) - signal) < 0.05
     short = np.array([1.0, 2.0, np.nan])
     assert np.array_equal(expected(short), short, equal_nan=True)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.03])
+def test_a_motor_that_lags_pushes_as_it_lags(tmp_path: Path, lag: float) -> None:
+    """What it pushed without noise is told by its commands and its reports together: nearer to it than either alone."""
+    physics = [{"name": "actuator_lag", "target": ["front_left"], "time_constant": lag}]
+    robot = dataclasses.replace(FLOW_BASE, physics=read_physics(physics, FLOW_BASE.caster_names))
+    excitation = make_excitation("identification", FLOW_BASE, 20.0, 0)
+    record_run(robot, excitation.twist, excitation.duration, 3, tmp_path / "run", "reduced", controlled_as=FLOW_BASE)
+    recording = Recording.open(tmp_path / "run", FLOW_BASE)
+    known = quiet_torque(FLOW_BASE, recording)
+    assert known is not None and not known[1].any()
+    reported, commanded = recording.joint_states.effort, held_commands(FLOW_BASE, recording)
+    assert reported is not None and commanded is not None
+    noise = FLOW_BASE.sensors.encoders.torque_noise
+    rest = (known[0] - reported)[20:-20, 0, DRIVE]
+    # What is not noise would be in the difference, beyond the noise of the report.
+    assert np.std(rest) == pytest.approx(noise, rel=0.15)
+    if lag:
+        assert np.std((commanded - reported)[20:-20, 0, DRIVE]) > 3.0 * noise
+    else:
+        assert np.std((known[0] - commanded)[20:-20, 0, DRIVE]) < 0.3 * noise
 
 
 def test_errors_of_reported_torques_are_told_by_the_balance_of_forces(tmp_path: Path) -> None:

@@ -38,6 +38,8 @@ ALIKE, MOST_ALIKE, FAR = 10.0, 3, 30.0
 FAR_MOVED = 2.0
 # What stands in for an effect that a gate stops must be worth so much [nats]: of little, much is alike.
 LEAST_STAND_IN = 30.0
+# Waves of a floor are tried anew beside what was found: these lengths [m], and so many directions; the best few are refined.
+WAVELENGTHS, WAVE_DIRECTIONS, WAVE_STARTS = np.geomspace(0.3, 4.0, 10), 12, 3
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # So often the outline of a patch is searched, each time from where the last one was made exact.
@@ -112,7 +114,8 @@ class EffectSearch(SetGrowth):
                 break
         threshold = self.calibrate(regression, instances)
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
-        return self.with_outlines(self.bounded(self.retuned_away(self.against_alike(self.against_fewer(selection)))))
+        selection = self.against_alike(self.against_fewer(self.with_best_waves(selection)))
+        return self.with_outlines(self.bounded(self.retuned_away(selection)))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
         """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
@@ -156,7 +159,7 @@ class EffectSearch(SetGrowth):
                 own = self._exact_evidence(selection.regression, selection.fit) if own is None else own
                 loss = own - evidence
             if loss < selection.threshold:
-                self._note_drop(self.label(instance), loss, "re-tuning does the same")
+                self.note_drop(self.label(instance), loss, "re-tuning does the same")
                 self._exact_at(instead)
                 regression = self.whiten_beside(others)
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
@@ -184,7 +187,7 @@ class EffectSearch(SetGrowth):
         if all(within):
             return selection
         index = min((k for k, inside in enumerate(within) if not inside), key=selection.losses.__getitem__)
-        self._note_drop(self.label(instances[index]), selection.losses[index], "beyond its bounds")
+        self.note_drop(self.label(instances[index]), selection.losses[index], "beyond its bounds")
         others = instances[:index] + instances[index + 1 :]
         return self.bounded(self.retuned_away(self.prune(self.whiten_beside(others), others, selection.threshold)))
 
@@ -305,6 +308,34 @@ class EffectSearch(SetGrowth):
                 if regression.within_bounds(fit):
                     found.append((candidate.instance, fit))
         return found
+
+    def with_best_waves(self, selection: Selection) -> Selection:
+        """The selection with the waves of a floor that fit best beside the rest of it.
+
+        A first look chose them, beside all that is there, and they were refined from there: where wheels hardly leave their
+        place other waves do nearly as well, and what these leave passes for further effects.
+        """
+        instances = selection.fit.instances
+        index = next((k for k, i in enumerate(instances) if "wavelength" in dict(i.shape)), None)
+        if index is None:
+            return selection
+        regression, own = selection.regression, instances[index]
+        others = instances[:index] + instances[index + 1 :]
+        turns = np.arange(WAVE_DIRECTIONS) * math.tau / WAVE_DIRECTIONS
+        starts = [
+            regression.with_shape(own, dict(own.shape) | {"wavelength": float(length), "direction": float(turn)})
+            for length in WAVELENGTHS for turn in turns
+        ]  # fmt: skip
+        gains = [regression.fit((*others, start)).log_evidence for start in starts]
+        best = [starts[k] for k in np.argsort(gains)[-WAVE_STARTS:]]
+        rivals = [refined_shape(regression, others, start) for start in best]
+        evidence = [regression.fit((*others, rival)).log_evidence for rival in rivals]
+        chosen = int(np.argmax(evidence))
+        gain = evidence[chosen] - selection.fit.log_evidence
+        if gain < STEADY_EVIDENCE:
+            return selection
+        self.progress(f"{self.label(own)} as {self.label(rivals[chosen])}: {gain:.1f} nats")
+        return self.settle_on(self.conclude((*others, rivals[chosen]), selection.threshold), selection.threshold)
 
     def with_outlines(self, selection: Selection) -> Selection:
         """Exchange outlines of patches for those that fit best, and note all that were tried."""
@@ -438,7 +469,7 @@ class EffectSearch(SetGrowth):
                     break
                 for instance, loss in zip(instances, losses, strict=True):
                     if instance not in needed:
-                        self._note_drop(self.label(instance), loss, "little together with others")
+                        self.note_drop(self.label(instance), loss, "little together with others")
                 instances = needed
                 self._exact_at(regression.fit(instances))
                 regression = regression.moved(self.problem)
@@ -450,7 +481,7 @@ class EffectSearch(SetGrowth):
                 instances = self.made_exact(outlined)
                 regression = self.whiten_beside(instances)
                 continue
-            self._note_drop(self.label(instances[index]), loss, reasons[index], held_out[index])
+            self.note_drop(self.label(instances[index]), loss, reasons[index], held_out[index])
             point = self.problem.point
             elsewhere = point is not None and any(size.term == instances[index].term for size in point.sizes)
             dropped.add(instances[index].term)
@@ -512,7 +543,8 @@ class EffectSearch(SetGrowth):
                 break
         return None
 
-    def _note_drop(self, label: str, loss: float, reason: str, held_out: float | None = None) -> None:
+    def note_drop(self, label: str, loss: float, reason: str, held_out: float | None = None) -> None:
+        """Put on the ladder that an effect was dropped, and why."""
         self.progress(f"- {label}: {loss:.1f} nats, {reason}")
         self.ladder.append(LadderStep(f"drop {label}", loss, held_out, reason))
 

@@ -265,7 +265,8 @@ def _taking_over(search: EffectSearch, selection: Selection) -> Selection:
     """The selection in which effects take over what numbers that are the same thing have of it.
 
     A steering that is turned by 0.2 rad is said to be so, and not by 0.18 with a re-tuned zero for the rest: how much of it
-    lies within the tolerance nothing tells. That stays in the effect's interval.
+    lies within the tolerance nothing tells. That stays in the effect's interval. An effect that is then all within what a
+    healthy robot's numbers may be is given back to them.
     """
     description, fit = search.description, selection.fit
     valid = description.valid
@@ -284,9 +285,30 @@ def _taking_over(search: EffectSearch, selection: Selection) -> Selection:
                 held[number.name] = (instance.term, k), abs(float(products[j])) / size**2 * number.deviation
     if not held:
         return selection
+    before = {number.name: number.narrowed for number in search.problem.nuisances if number.name in held}
     search.taken_over = dict(held.values())
     search.problem = search.problem.narrowed(dict.fromkeys(held, TAKEN_OVER))
-    return search.conclude(search.made_exact(fit.instances), selection.threshold)
+    chosen = search.conclude(search.made_exact(fit.instances), selection.threshold)
+    tolerated = _tolerated(search, chosen)
+    if tolerated is None:
+        return chosen
+    search.taken_over = {}
+    search.problem = search.problem.narrowed(before)
+    search.note_drop(search.label(chosen.fit.instances[tolerated]), chosen.losses[tolerated], "within the tolerances")
+    rest = chosen.fit.instances[:tolerated] + chosen.fit.instances[tolerated + 1 :]
+    return _taking_over(search, search.conclude(search.made_exact(rest), selection.threshold))
+
+
+def _tolerated(search: EffectSearch, selection: Selection) -> int | None:
+    """An effect that is the same thing as numbers of the description, and no more of it than a healthy robot's; or None."""
+    position = len(search.problem.nuisances)
+    for index, instance in enumerate(selection.fit.instances):
+        room = np.array([search.taken_over.get((instance.term, k), 0.0) for k in instance.active])
+        sizes = np.abs(selection.fit.mean[position : position + len(room)])
+        position += len(room)
+        if np.all(sizes < HEALTHY * room):
+            return index
+    return None
 
 
 def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:

@@ -14,8 +14,6 @@ SAME_STAMP = 1e-6  # [s]
 # Where stamps tremble, a command and a state are of the same time that are nearer than this part of the shorter interval.
 SAME_PART = 0.25
 LARGEST_GAP = 0.05  # [s]; an older command is not held any more
-# A motor follows its commands where what it reports is so many times the command.
-FOLLOWS = (0.8, 1.2)
 SURE = 5.0  # deviations of chance, by which one way to read the stamps must be nearer to what was reported than another
 NOISE_BANDS = 10  # of all frequencies; the quietest holds no more than the noise
 # Of a periodogram that are averaged: few enough to see a motion, enough to see that there is none; and by how many deviations
@@ -66,27 +64,23 @@ def held_speeds(recording: Recording) -> FloatArray:
 def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatArray, BoolArray] | None:
     """Return the motors' torques with as little of the noise of their measurement as can be had; None if none was reported.
 
-    Where a motor follows its commands that is the command; elsewhere what was reported, see `expected`.
+    That is the command that a motor follows, and what is `expected` of the rest: late, short of it, or all where there was no
+    command.
 
     An effect that is a function of the reported torque would hold the very noise that the residual holds, and be found as
     small, or as large, as makes that noise least.
 
     Returns:
-        Torques (T, n, 2) [N m], and of which joints they are reported ones (n, 2).
+        Torques (T, n, 2) [N m], and of which joints nothing but the reported ones is known (n, 2).
     """
     reported, commanded = recording.joint_states.effort, held_commands(robot, recording)
     if reported is None:
         return None
-    quiet, follows = reported.copy(), np.zeros(reported.shape[1:], dtype=bool)
-    if commanded is not None:
-        both = np.isfinite(reported) & np.isfinite(commanded)
-        product = np.sum(np.where(both, reported * commanded, 0.0), axis=0)
-        slope = product / np.maximum(np.sum(np.where(both, commanded**2, 0.0), axis=0), 1e-300)
-        follows = (slope > FOLLOWS[0]) & (slope < FOLLOWS[1])
-        quiet = np.where(both & follows, commanded, reported)
-    for i, axis in np.argwhere(~follows):
-        quiet[:, i, axis] = expected(reported[:, i, axis])
-    return quiet, ~follows
+    told = np.zeros_like(reported) if commanded is None else np.where(np.isfinite(commanded), commanded, 0.0)
+    quiet = np.empty_like(reported)
+    for i, axis in np.ndindex(reported.shape[1:]):
+        quiet[:, i, axis] = told[:, i, axis] + expected(reported[:, i, axis] - told[:, i, axis])
+    return quiet, ~np.any(told, axis=0)
 
 
 def expected(values: FloatArray) -> FloatArray:

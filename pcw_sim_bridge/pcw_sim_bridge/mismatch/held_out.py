@@ -19,8 +19,9 @@ from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProbl
 from .whitened_regression import Instance, WhitenedRegression
 
 FOLDS = 4  # parts that manoeuvres are dealt out to in turn
-# Held-out data speak against an effect, whatever the fitted ones say, if its work adds so much to their error [nats].
-CONTRADICTED = 3.0
+# Held-out data speak against an effect, whatever the fitted ones say, if its work adds so much to their error [nats], and no
+# more than this part of it would be the best there.
+CONTRADICTED, LEAST_PART = 3.0, 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,8 +152,9 @@ class HeldOut:
         description that the fitted data leave open are open for both. What the fitted data have moved them by foretells as
         well as an effect does, however far that is; so what it costs is counted, too. And what no healthy robot's numbers do
         is not re-tuning: where that is more, the first is by how much the error is smaller than with those. But where what the
-        effect does is not in the held-out data, they speak against it however badly the fitted ones do without it: then the
-        first is by how much the error is smaller, and so negative, with what it does than with nothing in its place.
+        effect does is not in the held-out data, or next to none of it, they speak against it however badly the fitted ones do
+        without it: then the first is by how much the error is smaller, and so negative, with what it does than with nothing in
+        its place. Beside numbers that are a little off an effect of the right size may be too large by more than half.
         """
         both, alone = self.means(), self.means(index)
         better = self._foretold(self._kept(None)) - self._foretold(self._kept(index))
@@ -162,9 +164,11 @@ class HeldOut:
         rows = slice(*self.span(index))
         idle = both.copy()
         idle[:, rows] = 0.0
-        work = sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True))
+        work = 0.5 * float(sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True)))
         smaller = self._error(idle) - self._error(both)
-        return smaller if smaller < -CONTRADICTED else better, 0.5 * float(work)
+        # The error is a parabola of the part of the effect that is at work, and least at (1 + smaller / work) / 2 of it.
+        contradicted = smaller < -CONTRADICTED and smaller < (2.0 * LEAST_PART - 1.0) * work
+        return smaller if contradicted else better, work
 
     def _limits(self, means: FloatArray) -> FloatArray:
         """Changes (F, nuisances) up to which numbers of the description are those of a healthy robot, or as far as here."""

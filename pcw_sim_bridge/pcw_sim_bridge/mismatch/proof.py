@@ -139,6 +139,7 @@ class Prover:
         refused: set[Instance] = set()
         contradicted: list[Law] = []
         while True:
+            self.tuned = True
             self.laws = LawModels(explanation, refused)
             held_out = self._held_out(explanation)
             after = None
@@ -146,6 +147,7 @@ class Prover:
             if useless is None:
                 after = self._rollout(explanation, held_out)
                 simulated = self._misleading(explanation, held_out, after)
+                self.tuned = self._numbers_help(explanation, held_out, after)
                 useless = simulated or self._no_better(explanation, held_out)
             if useless is None:
                 break
@@ -162,10 +164,7 @@ class Prover:
                 explanation = self.reduce(explanation, kept)
         predicted = _of_description(held_out.problem)
         if self._is_patched(explanation):
-            predictions = _with_and_without_numbers(held_out)
-            errors = [self._error(explanation, held_out, prediction) for prediction in predictions]
-            self.tuned = errors[0] <= errors[1] and not self._simulates_worse(explanation, after)
-            predicted = predictions[0 if self.tuned else 1]
+            predicted = self._prediction(held_out)
             if not self.tuned:
                 after = self._rollout(explanation, held_out)
                 notes.append(
@@ -182,6 +181,17 @@ class Prover:
         finding = self._finding(explanation, held_out, predicted, after)
         laws = tuple(self.laws.laws.values())
         return Proof(explanation, finding, held_out, predicted, self.tuned, laws, tuple(dropped), tuple(notes))
+
+    def _numbers_help(self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None) -> bool:
+        """Whether numbers of the description as re-tuned beside the effects help held out, and lead no simulation astray."""
+        if not self._is_patched(explanation):
+            return True
+        errors = [self._error(explanation, held_out, prediction) for prediction in _with_and_without_numbers(held_out)]
+        return errors[0] <= errors[1] and not self._simulates_worse(explanation, after)
+
+    def _prediction(self, held_out: HeldOut) -> FloatArray:
+        """What the patch takes of the held-out residual (T, C), with re-tuned numbers if they go into it."""
+        return _with_and_without_numbers(held_out)[0 if self.tuned else 1]
 
     def _simulates_worse(self, explanation: Explanation, after: FloatArray | None) -> bool:
         """Whether the patched description is followed less well than the nominal one, all signals together."""
@@ -305,15 +315,15 @@ class Prover:
         return harms
 
     def _no_better(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
-        """The effect that helps least, where the description alone is followed better than with all of them.
+        """The effect that helps least, where the description alone is followed better than the patch with all of them.
 
         Each may help beside the others and numbers far off that it makes up for; what is proposed has to do so by itself.
         """
         if not self._is_patched(explanation) or not held_out.proposed:
             return None
-        best = min(self._error(explanation, held_out, prediction) for prediction in _with_and_without_numbers(held_out))
+        patched = self._error(explanation, held_out, self._prediction(held_out))
         alone = self._error(explanation, held_out, _of_description(held_out.problem))
-        if best <= (1.0 + ALLOWED_HARM) ** 2 * alone:
+        if patched <= (1.0 + ALLOWED_HARM) ** 2 * alone:
             return None
         return min(held_out.proposed, key=lambda index: held_out.help_of(index)[0]), "the description alone does better"
 
