@@ -85,7 +85,7 @@ def test_a_motor_that_lags_pushes_as_it_lags(tmp_path: Path, lag: float) -> None
     # What is not noise would be in the difference, beyond the noise of the report.
     assert np.std(rest) == pytest.approx(noise, rel=0.15)
     if lag:
-        assert np.std((commanded - reported)[20:-20, 0, DRIVE]) > 3.0 * noise
+        assert np.std((commanded - reported)[20:-20, 0, DRIVE]) > 2.0 * noise
     else:
         assert np.std((known[0] - commanded)[20:-20, 0, DRIVE]) < 0.3 * noise
 
