@@ -27,7 +27,7 @@ from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.open_set import Leftover
 from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
-from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot
+from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot, winds_up
 from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Channel, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
 from pcw_sim_bridge.mismatch.rollout import HORIZONS, Windows
@@ -174,6 +174,23 @@ def test_retuned_numbers_are_those_of_the_patched_robot() -> None:
     assert [tyre.mu_p for tyre in robot.tyres] == pytest.approx([0.9 * tyre.mu_p for tyre in THESIS.tyres])
     assert [tyre.lateral.mu_p for tyre in robot.tyres] == pytest.approx([0.9 * tyre.lateral.mu_p for tyre in THESIS.tyres])
     assert retuned_robot(THESIS, {"torque_lag": 1e-3, "imu.gyro_scale": 1.01}) == THESIS
+
+
+def test_relaxation_lengths_are_retuned_from_those_of_each_tyre() -> None:
+    """They were all set to one length, that of the floor's own description, whatever tyre a caster has."""
+    described = [0.04, 0.04, 0.05, 0.03]
+    robot = THESIS
+    for name, length in zip(THESIS.caster_names, described, strict=True):
+        robot = robot.with_tyres([name], lambda tyre, length=length: dataclasses.replace(tyre, relaxation_length=length))
+    retuned = retuned_robot(robot, {"contact.relaxation_length": 0.045})
+    assert [tyre.relaxation_length for tyre in retuned.tyres] == pytest.approx([length + 0.005 for length in described])
+    unchanged = retuned_robot(robot, {"contact.stiffness": 1.1})
+    assert [tyre.relaxation_length for tyre in unchanged.tyres] == pytest.approx(described)
+
+
+@pytest.mark.parametrize(("effect", "winds"), [("gear_backlash", True), ("tyre_relaxation", True), ("payload_mass", False)])
+def test_of_what_winds_up_no_simulation_tells(effect: str, winds: bool) -> None:
+    assert winds_up(effect) is winds and moves_the_robot(effect) is not winds
 
 
 def test_sliding_friction_is_retuned_with_the_rest_of_it() -> None:

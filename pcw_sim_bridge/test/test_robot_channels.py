@@ -341,6 +341,29 @@ def test_a_tyre_near_its_peak_is_not_asked_how_much_it_slips() -> None:
     )
 
 
+@pytest.mark.parametrize("own", [None, 0.04])
+def test_a_tyre_relaxes_from_its_own_length_on(tmp_path: Path, own: float | None) -> None:
+    """Of casters with tyres of their own the column was taken from the floor's length on, and was of the wrong sign."""
+    names = THESIS.caster_names
+    robot = THESIS if own is None else THESIS.with_tyres(names, lambda tyre: dataclasses.replace(tyre, relaxation_length=own))
+    problem = RobotProblemBuilder(robot, [record(tmp_path, robot, 3)]).build()
+    term = [term.key for term in problem.terms].index(f"tyre_relaxation/{names[1]}")
+    column, longer = problem.columns(term, ())[:, :, 0], 0.1
+    assert problem.exact is not None
+    exact = problem.exact({}, [SizedTerm(term, (), np.array([longer]), (0,))])
+    assert exact is not None
+    taken, first_order = (np.where(problem.valid, values, 0.0) for values in (problem.residual - exact[0], column * longer))
+    slips = slice(3, 3 + 2 * THESIS.n)
+    assert np.sum(taken[:, slips] * first_order[:, slips]) / np.sum(first_order[:, slips] ** 2) == pytest.approx(1.0, abs=0.1)
+
+
+def test_tyres_that_differ_are_not_said_to_relax_alike(tmp_path: Path) -> None:
+    robot = THESIS.with_tyres([THESIS.caster_names[0]], lambda tyre: dataclasses.replace(tyre, relaxation_length=0.05))
+    problem = RobotProblemBuilder(robot, [record(tmp_path, robot, 3)]).build()
+    relaxing = [term.target for term in problem.terms if term.effect == "tyre_relaxation"]
+    assert sorted(relaxing) == sorted((name,) for name in THESIS.caster_names)
+
+
 def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path) -> None:
     """Exact where it was at work in the second, the model leaves the first as it was, and less of the second."""
     push = {"name": "external_push", "target": ["chassis"], "force_x": 40.0, "start": 5.0, "duration": 2.0}

@@ -80,11 +80,18 @@ def is_event(effect_name: str) -> bool:
 def moves_the_robot(effect_name: str) -> bool:
     """Whether a simulation can tell for or against an effect.
 
-    No error of an IMU or of a clock moves a robot; and how far a gear is wound up where a simulation begins, and how fast,
-    cannot be read from filtered signals.
+    No error of an IMU or of a clock moves a robot, and of what winds up a simulation does not know how it begins.
     """
-    effect = get(effect_name)
-    return effect.target_kind not in ("imu", "clock") and not isinstance(effect, TransmissionEffect)
+    return get(effect_name).target_kind not in ("imu", "clock") and not winds_up(effect_name)
+
+
+def winds_up(effect_name: str) -> bool:
+    """Whether an effect keeps something that a simulation would have to begin with.
+
+    How far a gear or a tyre is wound up, and how fast, cannot be read from filtered signals: a tyre may take up its force over
+    more than a window's whole way.
+    """
+    return isinstance(get(effect_name), TransmissionEffect) or effect_name == "tyre_relaxation"
 
 
 class Prover:
@@ -197,6 +204,8 @@ class Prover:
         """Whether the patched description is followed less well than the nominal one, all signals together."""
         windows = self._quiet_windows(explanation)
         if windows is None or self.before is None or after is None:
+            return False
+        if any(winds_up(named.term.effect) for named in explanation.named):
             return False
         errors = _rollout_errors(windows, self.before, after, self.rng, [MAIN_HORIZON]).pooled()
         return bool(len(errors.judged)) and float(errors.worse()[0]) > 0.0

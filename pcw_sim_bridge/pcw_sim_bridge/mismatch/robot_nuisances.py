@@ -270,10 +270,15 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
             yield "torque_constant", f"torque_constant/{caster.name}_{axis_name}", 1.0, _gain(i, axis)
 
 
+def common_relaxation(robot: RobotDescription) -> float:
+    """Return the relaxation length of the casters' tyres, the mean of them [m]."""
+    return float(np.mean([tyre.relaxation_length for tyre in robot.tyres]))
+
+
 def _tyres(robot: RobotDescription) -> Iterator[Deviation]:
     yield "contact.stiffness", "contact.stiffness", 1.0, _entry("softness")
     yield "contact.mu_p", "contact.mu_p", 1.0, _friction
-    length = robot.contact.relaxation_length
+    length = common_relaxation(robot)
 
     def relaxation(numbers: ModelNumbers, step: float) -> None:
         numbers.tyres[:, LENGTH] += step

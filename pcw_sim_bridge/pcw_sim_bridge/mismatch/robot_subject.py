@@ -33,7 +33,7 @@ from .found_effect import effect_instance
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
-from .robot_nuisances import FLOOR, rotor_armature
+from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
 from .robot_rollout import robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
@@ -307,7 +307,8 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
     if not any(name.startswith("contact.") for name in retuned):
         return robot
     common, friction = retuned.get("contact.stiffness", 1.0), retuned.get("contact.mu_p", 1.0)
-    length = retuned.get("contact.relaxation_length")
+    described = common_relaxation(robot)
+    longer = retuned.get("contact.relaxation_length", described) - described
 
     def tyre(caster: str, old: ContactDescription) -> ContactDescription:
         along, across = (
@@ -317,7 +318,7 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
         lateral = dataclasses.replace(
             old.lateral, mu_p=friction * old.lateral.mu_p, lambda_p=min(old.lateral.lambda_p * across, 1.0)
         )
-        relaxation = old.relaxation_length if length is None else _positive(length, old.relaxation_length)
+        relaxation = _positive(old.relaxation_length + longer, old.relaxation_length)
         # Of the numbers that shape a curve one is a friction, too.
         shape = {name: value * friction if name == "mu_c" else value for name, value in old.shape.items()}
         return dataclasses.replace(

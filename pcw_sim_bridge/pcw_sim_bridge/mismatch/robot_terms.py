@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -201,7 +202,9 @@ class _TermMaker:
             return None
         if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):
             return None
-        neutral = {p.name: self._neutral(p) for p in searched}
+        neutral = {p.name: self._neutral(p, target) for p in searched}
+        if any(math.isnan(value) for value in neutral.values()):
+            return None
         look = _look_of(effect)
         looked = self.looked if recording is None else self.looked.only(recording)
         chosen = self._looked_for(looked, effect, look, neutral) if look else self._grid(effect)
@@ -332,17 +335,20 @@ class _TermMaker:
         angles = np.concatenate([np.stack([m.position[:, i, k] for i, k in joints]) for m in self.differences.motions], axis=1)
         return bool(np.ptp(angles, axis=1).max() > HALF_A_TURN)
 
-    def _neutral(self, parameter: EffectParameter) -> float:
-        """Value at which the parameter changes nothing."""
+    def _neutral(self, parameter: EffectParameter, target: Sequence[str]) -> float:
+        """Value at which the parameter changes nothing; NaN where that is another one for every target."""
         if isinstance(parameter.neutral, float):
             return parameter.neutral
         if parameter.reciprocal:
             return parameter.upper
         if parameter.neutral:
-            value: object = self.robot
-            for attribute in parameter.neutral.split("."):
-                value = getattr(value, attribute)
-            return float(value)  # type: ignore[arg-type]
+            part, _, attribute = parameter.neutral.rpartition(".")
+            if part == "contact":  # casters may have tyres of their own
+                owners: Sequence[object] = [self.robot.tyres[self.robot.caster_index(name)] for name in target]
+            else:
+                owners = [operator.attrgetter(part)(self.robot) if part else self.robot]
+            described = {float(getattr(owner, attribute)) for owner in owners}
+            return described.pop() if len(described) == 1 else math.nan
         return 0.0
 
     def _grid(self, effect: Effect) -> ChosenShapes | None:
