@@ -306,7 +306,7 @@ def _tolerated(search: EffectSearch, selection: Selection) -> int | None:
         room = np.array([search.taken_over.get((instance.term, k), 0.0) for k in instance.active])
         sizes = np.abs(selection.fit.mean[position : position + len(room)])
         position += len(room)
-        if np.all(sizes < HEALTHY * room):
+        if len(room) and np.all(sizes < HEALTHY * room):
             return index
     return None
 

@@ -72,8 +72,8 @@ def _without_instruments(differences: ChannelDifferences, usable: BoolArray, nui
                 [np.ones_like(values), values, np.tanh(values / FRICTION_SPEED)], axis=1
             )
         torques.append(columns.reshape(*motion.torque.shape, -1))
-    known = np.stack([n.column[:, FORCES] for n in nuisances if n.name.startswith(INSTRUMENTS)], axis=2)
-    columns = np.concatenate([known, differences.of_torque(torques)[:, FORCES]], axis=2)
+    known = [n.column[:, FORCES, None] for n in nuisances if n.name.startswith(INSTRUMENTS)]
+    columns = np.concatenate([*known, differences.of_torque(torques)[:, FORCES]], axis=2)
     # The residual holds the torque as it was reported; its errors are sought beyond those that are out of the quiet one.
     known_errors = [(motion.torque - motion.quiet_torque)[..., None] for motion in differences.motions]
     residual = differences.residual[:, FORCES] + differences.of_torque(known_errors)[:, FORCES, 0]
