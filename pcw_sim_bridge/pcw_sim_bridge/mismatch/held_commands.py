@@ -19,6 +19,9 @@ NOISE_BANDS = 10  # of all frequencies; the quietest holds no more than the nois
 # Of a periodogram that are averaged: few enough to see a motion, enough to see that there is none; and by how many deviations
 # of chance they have to be more than noise.
 SMOOTHED_ORDINATES, SURE_POWER = 25, 3.0
+LEAST_SAMPLES = 10 * SMOOTHED_ORDINATES
+# A motor follows its commands if no more than this part of the noise is expected beyond them: so much chance leaves.
+NOISE_PART = 0.5
 
 
 def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray | None:
@@ -76,11 +79,27 @@ def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatAr
     reported, commanded = recording.joint_states.effort, held_commands(robot, recording)
     if reported is None:
         return None
-    told = np.zeros_like(reported) if commanded is None else np.where(np.isfinite(commanded), commanded, 0.0)
+    commanded = np.full_like(reported, np.nan) if commanded is None else commanded
+    told = np.isfinite(commanded).any(axis=0)
     quiet = np.empty_like(reported)
-    for i, axis in np.ndindex(reported.shape[1:]):
-        quiet[:, i, axis] = told[:, i, axis] + expected(reported[:, i, axis] - told[:, i, axis])
-    return quiet, ~np.any(told, axis=0)
+    for i, axis in np.ndindex(told.shape):
+        measured, command = reported[:, i, axis], commanded[:, i, axis]
+        if not told[i, axis]:
+            quiet[:, i, axis] = expected(measured)
+            continue
+        rest = measured - command
+        given = command + (0.0 if _is_noise(rest) else expected(rest))
+        quiet[:, i, axis] = np.where(np.isfinite(given), given, measured)
+    return quiet, ~told
+
+
+def _is_noise(rest: FloatArray) -> bool:
+    """Whether what is reported beyond a command (T,) is noise, or too short to tell."""
+    known = rest[np.isfinite(rest)]
+    if len(known) < LEAST_SAMPLES:
+        return True
+    quiet = expected(known)
+    return bool(np.std(quiet) <= NOISE_PART * np.std(known - quiet))
 
 
 def expected(values: FloatArray) -> FloatArray:
@@ -91,7 +110,7 @@ def expected(values: FloatArray) -> FloatArray:
     small by the noise's part: Carroll et al., Measurement Error in Nonlinear Models, 2nd ed. (2006), chapter 4.
     """
     known = np.flatnonzero(np.isfinite(values))
-    if len(known) < 10 * SMOOTHED_ORDINATES:
+    if len(known) < LEAST_SAMPLES:
         return values
     rows = np.arange(len(values))
     whole = np.interp(rows, known, values[known])
