@@ -80,7 +80,7 @@ def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatAr
     if reported is None:
         return None
     commanded = np.full_like(reported, np.nan) if commanded is None else commanded
-    told = np.isfinite(commanded).any(axis=0)
+    told: BoolArray = np.isfinite(commanded).max(axis=0)
     quiet = np.empty_like(reported)
     for i, axis in np.ndindex(told.shape):
         measured, command = reported[:, i, axis], commanded[:, i, axis]
