@@ -67,7 +67,9 @@ def held_speeds(recording: Recording) -> FloatArray:
     return np.where(fresh[:, None, None], commands.velocity[np.maximum(last, 0)], np.nan)
 
 
-def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatArray, BoolArray] | None:
+def quiet_torque(
+    robot: RobotDescription, recording: Recording, live: bool = False
+) -> tuple[FloatArray, BoolArray] | None:
     """Return the motors' torques with as little of the noise of their measurement as can be had; None if none was reported.
 
     That is the command that a motor follows, and what is `expected` of the rest: late, short of it, or all where there was no
@@ -76,6 +78,10 @@ def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatAr
     An effect that is a function of the reported torque would hold the very noise that the residual holds, and be found as
     small, or as large, as makes that noise least.
 
+    Args:
+        robot: the robot; recording: of it.
+        live: a window of a running robot, or what such windows are judged by: too short to tell a motor that lags.
+
     Returns:
         Torques (T, n, 2) [N m], and of which joints nothing but the reported ones is known (n, 2).
     """
@@ -83,7 +89,7 @@ def quiet_torque(robot: RobotDescription, recording: Recording) -> tuple[FloatAr
     if reported is None:
         return None
     commanded = np.full_like(reported, np.nan) if commanded is None else commanded
-    long = float(np.ptp(recording.joint_states.stamp)) >= LEAST_DURATION
+    long = not live and float(np.ptp(recording.joint_states.stamp)) >= LEAST_DURATION
     told: BoolArray = np.isfinite(commanded).max(axis=0)
     quiet = np.empty_like(reported)
     for i, axis in np.ndindex(told.shape):

@@ -242,7 +242,7 @@ class LiveChannels:
         if self._learned() < self.parameters.learning:
             return self._nothing(*problems)
         recording = Recording.of_messages(self._ring.since(0), self.robot)
-        builder = RobotProblemBuilder(self.robot, [recording])
+        builder = RobotProblemBuilder(self.robot, [recording], live=True)
         reader = RowReader(self.robot, builder.cutoff)
         window = reader.go_on(recording, builder)
         rate = float(np.mean([f.decimated_rate for f in builder.filters]))

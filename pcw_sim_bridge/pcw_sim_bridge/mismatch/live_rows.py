@@ -157,7 +157,7 @@ class RowReader:
 
     def _opened(self, messages: Sequence[RawMessage]) -> tuple[Recording, RobotProblemBuilder]:
         recording = Recording.of_messages(messages, self.robot)
-        return recording, RobotProblemBuilder(self.robot, [recording], self.cutoff)
+        return recording, RobotProblemBuilder(self.robot, [recording], self.cutoff, live=True)
 
     def go_on(self, recording: Recording, builder: RobotProblemBuilder) -> Window:
         """Return what is new in a recording whose builder has been made, and go on from there."""

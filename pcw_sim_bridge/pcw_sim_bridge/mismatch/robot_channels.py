@@ -65,7 +65,7 @@ class RobotProblemBuilder:
     """Builds the regression problem of a robot from its recordings."""
 
     def __init__(
-        self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None
+        self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None, live: bool = False
     ) -> None:
         """Filter the recordings.
 
@@ -73,6 +73,7 @@ class RobotProblemBuilder:
             robot: the nominal robot.
             recordings: opened with this robot.
             cutoff: of the channel filter [Hz]; None chooses it from the noise of the encoders.
+            live: these are windows of a running robot, or what they are judged by: see `quiet_torque`.
 
         Raises:
             MismatchError: no piece is long enough.
@@ -82,7 +83,7 @@ class RobotProblemBuilder:
         self.cutoff = cutoff if cutoff is not None else choose_cutoff(robot, recordings)
         motions: list[RobotMotion] = []
         for index, recording in enumerate(recordings):
-            motions += read_motions(robot, recording, index, self.cutoff, balanced)
+            motions += read_motions(robot, recording, index, self.cutoff, balanced, live)
         if not motions:
             raise MismatchError(f"no contiguous piece of at least {SHORTEST_SEGMENT:g} s in the recordings")
         imu = any(np.isfinite(motion.imu).any() for motion in motions)

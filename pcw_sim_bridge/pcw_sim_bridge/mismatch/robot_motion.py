@@ -85,7 +85,7 @@ class RobotMotion:
 
 
 def read_motions(
-    robot: RobotDescription, recording: Recording, index: int, cutoff: float, with_torque: bool
+    robot: RobotDescription, recording: Recording, index: int, cutoff: float, with_torque: bool, live: bool = False
 ) -> list[RobotMotion]:
     """Return the pieces of a recording that are long enough and whole.
 
@@ -94,13 +94,14 @@ def read_motions(
         recording: the recording; `index` is its number.
         cutoff: of the channels' filter [Hz]; motions are filtered `PREFILTER_RATIO` times wider.
         with_torque: samples without motor torque are left out.
+        live: see `quiet_torque`.
     """
     motions = []
     joints = recording.joint_states
     n = robot.n
     torque = joints.effort if joints.effort is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([joints.position.reshape(-1, 2 * n), torque.reshape(-1, 2 * n)], axis=1)
-    quiet, reported = quiet_torque(robot, recording) or (torque, np.ones((n, 2), dtype=bool))
+    quiet, reported = quiet_torque(robot, recording, live) or (torque, np.ones((n, 2), dtype=bool))
     wanted = held_speeds(recording)
     speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([signals, quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n), wanted.reshape(-1, 2 * n)], axis=1)
