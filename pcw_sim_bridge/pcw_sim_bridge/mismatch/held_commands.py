@@ -1,4 +1,4 @@
-"""The torque commands that a robot's joints held at the stamps of its joint states."""
+"""What a robot's joints were commanded at the stamps of its joint states, and its motors' torques without noise."""
 
 from __future__ import annotations
 
@@ -41,11 +41,9 @@ def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray |
         return None
 
     def held(latest: FloatArray) -> FloatArray:
-        last = np.searchsorted(commands.stamp, latest, side="left") - 1
-        fresh = (last >= 0) & (joints.stamp - commands.stamp[np.maximum(last, 0)] < LARGEST_GAP)
-        effort = np.clip(commands.effort[np.maximum(last, 0)], -robot.torque_limit, robot.torque_limit)
-        return np.where(fresh[:, None, None], effort, np.nan)
+        return _held(commands.stamp, effort, latest, joints.stamp)
 
+    effort = np.clip(commands.effort, -robot.torque_limit, robot.torque_limit)
     same = SAME_PART * min(float(np.median(np.diff(series.stamp))) for series in (commands, joints))
     found = held(joints.stamp - SAME_STAMP)
     for offset in (-same, SAME_STAMP, same):
@@ -62,9 +60,14 @@ def held_speeds(recording: Recording) -> FloatArray:
     commands, joints = recording.joint_commands, recording.joint_states
     if commands is None or commands.velocity is None or len(commands.stamp) < 2:
         return np.full_like(joints.position, np.nan)
-    last = np.searchsorted(commands.stamp, joints.stamp - SAME_STAMP, side="left") - 1
-    fresh = (last >= 0) & (joints.stamp - commands.stamp[np.maximum(last, 0)] < LARGEST_GAP)
-    return np.where(fresh[:, None, None], commands.velocity[np.maximum(last, 0)], np.nan)
+    return _held(commands.stamp, commands.velocity, joints.stamp - SAME_STAMP, joints.stamp)
+
+
+def _held(given: FloatArray, commands: FloatArray, latest: FloatArray, stamp: FloatArray) -> FloatArray:
+    """The last of commands (M, n, 2) given before the latest time (T,) for each stamp (T,); NaN where it is too old."""
+    last = np.searchsorted(given, latest, side="left") - 1
+    fresh = (last >= 0) & (stamp - given[np.maximum(last, 0)] < LARGEST_GAP)
+    return np.where(fresh[:, None, None], commands[np.maximum(last, 0)], np.nan)
 
 
 def quiet_torque(
