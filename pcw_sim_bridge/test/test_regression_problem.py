@@ -423,6 +423,25 @@ def test_an_interval_is_wide_where_stretches_of_a_recording_disagree():
     assert 373 <= held <= 389  # 95 % are 380; with a normal distribution of what few blocks say, 371
 
 
+@pytest.mark.parametrize(("effect", "number", "doubted"), [
+    ("payload_mass", "module.mass", True), ("payload_mass", "steer_zero/left", False), ("motor_cogging", "module.mass", False),
+])  # fmt: skip
+def test_a_payload_beside_masses_that_no_healthy_robot_has_is_half_as_sure(effect: str, number: str, doubted: bool) -> None:
+    """Whatever is missing of a balance of forces is shared out among all that do the same to it."""
+    time = np.arange(5 * SAMPLES) / RATE
+    column, other = np.sin(2.1 * time), np.cos(1.3 * time)
+    for moved in (1.0, 6.0):
+        measured = column + 0.1 * moved * other + NOISE * np.random.default_rng(1).standard_normal(len(time))
+        size = LinearParameter("size", "1", 0.0, 10.0, 1.0)
+        problem = one_channel(
+            measured, measured, nuisances=(Nuisance(number, "kg", 1.0, 0.1, other[:, None]),),
+            terms=(Term(effect, ("chassis",), (size,), ({},), lambda shape: column[:, None, None]),),
+        )  # fmt: skip
+        search = EffectSearch(problem, np.random.default_rng(0))
+        [named] = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))
+        assert named.probability == pytest.approx(0.5 if doubted and moved > 4.0 else 1.0, abs=0.02)
+
+
 def geared_problem(play: float, twist: float) -> RegressionProblem:
     """A gear that plays, or twists: its teeth give way by 0.3 of what a soft gear of size one does."""
     time = np.arange(5 * SAMPLES) / RATE

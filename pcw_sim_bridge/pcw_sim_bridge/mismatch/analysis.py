@@ -16,7 +16,14 @@ from pcw_description.effects.registry import all_effects, also_known, get
 
 from .all_cores import side_by_side
 from .command_findings import CommandFindings, command_findings
-from .explanation import Explanation, NamedTerm, explain, explanation_by
+from .explanation import (
+    OF_THE_BALANCE,
+    Explanation,
+    NamedTerm,
+    explain,
+    explanation_by,
+    strained_of_the_balance,
+)
 from .findings import (
     ChannelFinding,
     EffectFinding,
@@ -354,6 +361,10 @@ def _notes(
         if number.times > HEALTHY:
             far = f"{number.times:.1f} tolerances from the description"
             notes.append(f"{number.name} comes out {far}: check it or its tolerance.")
+    doubted = sorted({named.term.effect for named in explanation.named if named.term.effect in OF_THE_BALANCE})
+    strained = strained_of_the_balance(problem, explanation.fit)
+    if doubted and strained:
+        notes.append(f"{', '.join(doubted)} may stand for what {', '.join(strained)} show to be missing: half as sure.")
     if not has_holdout:
         notes.append(
             "No hold-out recording was given: the proof leaves out manoeuvres of the fitted ones, which the choice of the "

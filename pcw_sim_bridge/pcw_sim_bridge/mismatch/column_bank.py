@@ -9,6 +9,7 @@ import numpy as np
 from .regression_problem import FloatArray, IntArray
 
 ROOM = 32  # columns
+AT_ONCE = 64  # groups of columns that are gathered at a time
 
 
 class ColumnBank:
@@ -63,11 +64,13 @@ class ColumnBank:
 
     def own_grams(self, places: IntArray) -> FloatArray:
         """Gram matrices (K, P, P) of K groups of columns (K, P)."""
-        data = [self._data[places[:, p]] for p in range(places.shape[1])]
         found = np.empty((*places.shape, places.shape[1]))
-        for p, left in enumerate(data):
-            for q, right in enumerate(data[: p + 1]):
-                found[:, p, q] = found[:, q, p] = np.einsum("kr,kr->k", left, right)
+        for start in range(0, len(places), AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            data = [self._data[places[some, p]] for p in range(places.shape[1])]
+            for p, left in enumerate(data):
+                for q, right in enumerate(data[: p + 1]):
+                    found[some, p, q] = found[some, q, p] = np.einsum("kr,kr->k", left, right)
         return found
 
     def products(self, places: IntArray, others: IntArray) -> FloatArray:

@@ -143,13 +143,16 @@ class EffectSearch(SetGrowth):
         """Drop effects that other numbers of the description stand in for as soon as the problem is exact at those.
 
         Where it is exact with an effect at work, columns of the same cause differ by their curvature: with precise sensors
-        that is evidence enough for an effect that is well within a tolerance.
+        that is evidence enough for an effect that is well within a tolerance. And where numbers have moved far to make room
+        for an effect, it takes them back to do without.
         """
         instances = selection.fit.instances
         own: float | None = None
         for index, instance in enumerate(instances):
             others = instances[:index] + instances[index + 1 :]
             instead = selection.regression.retuned_instead(selection.fit, index)
+            if instead is None and self._is_strained(selection.fit):
+                instead = selection.regression.fit(others)
             if instead is None:
                 continue
             evidence = self._exact_evidence(selection.regression, instead)

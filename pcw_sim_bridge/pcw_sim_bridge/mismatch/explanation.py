@@ -53,6 +53,11 @@ REFINEMENT_LOG_PRIOR = -3.0
 HALF_WIDTH = 1.96
 # Columns of an effect and of a number that are alike to this are those of one thing.
 SAME = 0.9999
+# Effects and numbers that share out among each other what all torques do to the robot, and how much such an effect is believed
+# beside such numbers that no healthy robot has.
+OF_THE_BALANCE = ("payload_mass", "payload_offset", "torque_constant_error")
+NUMBERS_OF_THE_BALANCE = ("chassis.", "module.", "wheel.inertia", "rotors.", "torque_constant/")
+BELIEF_BESIDE_STRAINED = 0.5
 # An effect that hides behind a number leaves less than this part of its strain's square.
 RELIEF = 0.5
 
@@ -566,7 +571,24 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
                 contribution,
             )
         )
-    return _doubted_by_scale(named)
+    doubted = _doubted_by_scale(named)
+    factor = BELIEF_BESIDE_STRAINED if strained_of_the_balance(problem, selection.fit) else 1.0
+    return tuple(
+        dataclasses.replace(entry, probability=factor * entry.probability) if entry.term.effect in OF_THE_BALANCE else entry
+        for entry in doubted
+    )
+
+
+def strained_of_the_balance(problem: RegressionProblem, fit: Fit) -> list[str]:
+    """Masses, inertias and torque constants that come out as none of a healthy robot does.
+
+    Whatever else is missing there is shared out among them and the effects that do the same to the balance of forces.
+    """
+    return [
+        number.name for number, mean in zip(problem.nuisances, fit.mean, strict=False)
+        if number.name.startswith(NUMBERS_OF_THE_BALANCE) and number.narrowed != TAKEN_OVER and not number.loose
+        and abs(float(mean)) > STRAINED * number.deviation
+    ]  # fmt: skip
 
 
 def _as_wide(

@@ -114,7 +114,7 @@ class RobotProblemBuilder:
         """
         differences = ChannelDifferences(self.model, self.motions, self.filters)
         valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
-        if with_terms and self.layout.balanced and any(motion.reported.any() for motion in self._read):
+        if with_terms and self.layout.balanced:
             self._read = with_balanced_torques(self._read, differences, valid, nuisances)
             self.motions = self._motions_of(self.model)
             differences = ChannelDifferences(self.model, self.motions, self.filters)

@@ -47,11 +47,11 @@ class RobotMotion:
         quiet_torque: the torque without the noise of its measurement, as far as that can be had (T, n, 2); torque_rate: its
             rate.
         reported: joints of which that is a measured torque (n, 2).
-        balanced_torque: the quiet torque without the errors that the balance of forces shows of it (T, n, 2), see
-            `torque_errors`: what effects are functions of. What makes wheels slip is the quiet one: no balance tells which
-            wheel a force acts at.
+        balanced_torque: the quiet torque that fits the motion as it was measured (T, n, 2), see `torque_errors`: what
+            effects are functions of. What makes wheels slip is the quiet one: no balance tells which wheel a force acts at.
         loops: of drives that hold commanded speeds by loops of their own (T, n, 2, 2): what accelerates their joints [N m],
-            and what would within a second if they were behind their speeds [N m s]; zero elsewhere.
+            and what would within a second if they were behind their speeds [N m s]; zero elsewhere. Where no commands were
+            recorded they may be such drives, behind nobody knows what.
         imu: yaw rate and acceleration x, y (T, 3); NaN where not recorded.
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
@@ -102,7 +102,8 @@ def read_motions(
     torque = joints.effort if joints.effort is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([joints.position.reshape(-1, 2 * n), torque.reshape(-1, 2 * n)], axis=1)
     quiet, reported = quiet_torque(robot, recording, live) or (torque, np.ones((n, 2), dtype=bool))
-    wanted = held_speeds(recording)
+    wanted, commands = held_speeds(recording), recording.joint_commands
+    unknown = commands is None or (commands.effort is None and commands.velocity is None)
     speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([signals, quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n), wanted.reshape(-1, 2 * n)], axis=1)
     rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
@@ -121,8 +122,8 @@ def read_motions(
             velocity = derivative(position, rate)
             acceleration = derivative(velocity, rate)
             loops = np.zeros((*velocity.shape, 2))
-            if np.isfinite(block[:, -2 * n :]).any():
-                behind = smooth[:, -2 * n :].reshape(velocity.shape) - velocity
+            if unknown or np.isfinite(block[:, -2 * n :]).any():
+                behind = np.zeros_like(velocity) if unknown else smooth[:, -2 * n :].reshape(velocity.shape) - velocity
                 loops = robot.felt_inertia[:, :, None] * np.stack([acceleration, behind], axis=3)
             torque = smooth[:, 2 * n : 4 * n].reshape(-1, n, 2)
             quiet = smooth[:, 4 * n + 6 : 6 * n + 6].reshape(-1, n, 2)

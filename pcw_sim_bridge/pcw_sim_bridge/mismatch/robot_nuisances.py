@@ -213,9 +213,10 @@ def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
     part = min(LOOP_BANDWIDTH * max(motion.sampling for motion in motions), LARGEST_UNREPORTED)
     for axis, name in enumerate(AXIS_NAMES):
         yield VariedNumber(f"torque_report.{name}", "1", 0.0, part, _entry("unreported", (axis, 0)))
-        yield VariedNumber(
-            f"torque_report.{name}_behind", "1/s", 0.0, 0.5 * LOOP_BANDWIDTH * part, _entry("unreported", (axis, 1))
-        )
+        if any(np.any(motion.loops[..., 1]) for motion in motions):
+            yield VariedNumber(
+                f"torque_report.{name}_behind", "1/s", 0.0, 0.5 * LOOP_BANDWIDTH * part, _entry("unreported", (axis, 1))
+            )
 
 
 def _geometry(robot: RobotDescription) -> Iterator[Deviation]:

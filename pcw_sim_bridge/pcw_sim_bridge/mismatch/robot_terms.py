@@ -38,7 +38,7 @@ from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
 HALF_A_TURN = math.pi  # [rad]
-LARGEST_TWIST = 0.2  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
+LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {

@@ -1,14 +1,17 @@
-"""What the balance of forces shows of the errors that reported torques have.
+"""Torques that fit the motion as it was measured: without what the balance of forces shows of the errors of both.
 
-Whoever multiplies all torques by a number below one makes their errors smaller, too, and the masses that go with them weigh
-hardly more than that is worth. So what effects are functions of must not hold the errors that the residual holds. Of all
-torques that could have made a residual r the most likely are those of least squares,
+Weaker motors, less mass and less friction at once are the same balance of forces, times a number below one, and all its errors
+are smaller by that number, be they of the torques or of the accelerations. That is worth more than the masses' tolerances, and
+a payload passed for weak motors of a light robot. So what effects are functions of must not hold the errors that the residual
+holds: then no factor makes them smaller. Of all torques that could have made a residual r the most likely are those of least
+squares,
 
     e = J^T (J J^T)^-1 r,      r = J e,
 
 J being what torques add to force and moment. From r goes first what holds no torque: masses and frictions. These are the
 instruments of two-stage least squares, by which a number is found that is a factor of something measured. Lengths are none:
-a lever multiplies the torque, and its errors with it.
+a lever multiplies the torque, and its errors with it. What depends on how a robot moves may be physics that is missing.
+Reports of torques may be wrong in that way, commands are not, and there only what fluctuates faster is taken for an error.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import interpolate
+from scipy import interpolate, ndimage
 
 from .channel_differences import ChannelDifferences
 from .noise_model import channel_deviations
@@ -28,13 +31,15 @@ FORCES = slice(0, 3)  # channels of the balance
 INSTRUMENTS = ("chassis.", "module.", "wheel.inertia", "rotors.", "suspension.", "ground.")  # numbers that hold no torque
 FRICTION_SPEED = 0.05  # [rad/s], at which dry friction reverses
 RIDGE = 1e-6  # of what a number explains, so that numbers which are the same thing share it
+SLOW = 0.4  # [s]; errors fluctuate faster than robots move, and than most of what depends on how they move
+FLUCTUATES = 0.75  # part of the mean square of white errors that is
 LEAST_ROWS = 200  # of the balance; fewer tell no errors from masses and frictions
 
 
 def with_balanced_torques(
     read: Sequence[RobotMotion], differences: ChannelDifferences, valid: BoolArray, nuisances: Sequence[Nuisance]
 ) -> list[RobotMotion]:
-    """Return motions with the errors of reported torques taken out of their `balanced_torque`.
+    """Return motions whose `balanced_torque` fits them.
 
     Args:
         read: the motions as they were read; differences: their channels under the description.
@@ -42,21 +47,34 @@ def with_balanced_torques(
         nuisances: numbers of the description.
     """
     usable: BoolArray = valid[:, FORCES].min(axis=1)
-    if not any(motion.reported.any() for motion in read) or usable.sum() < LEAST_ROWS:
+    if usable.sum() < LEAST_ROWS:
         return list(read)
     left = np.where(usable[:, None], _without_instruments(differences, usable, nuisances), 0.0)
     maps = differences.wrench_of_torque()
     found, start = [], 0
     for motion, own, of_torque in zip(read, differences.filters, maps, strict=True):
         stamps, there = own.decimate(motion.time), own.decimate(of_torque)  # (T, 3, n, 2)
-        rows = left[start : start + len(stamps)]
-        start += len(stamps)
-        there = (there * motion.reported).reshape(len(stamps), 3, -1)
+        here = slice(start, start + len(stamps))
+        rows, start = left[here], start + len(stamps)
+        if not motion.reported.any():
+            rows = rows * _fluctuates(rows, usable[here], own.decimated_rate)
+        there = there.reshape(len(stamps), 3, -1)
         plain = there @ there.swapaxes(1, 2)
         plain += 1e-9 * np.trace(plain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         errors = there.swapaxes(1, 2) @ np.linalg.solve(plain, rows[:, :, None])
         along = interpolate.CubicSpline(stamps, errors[:, :, 0])(np.clip(motion.time, stamps[0], stamps[-1]))
         found.append(dataclasses.replace(motion, balanced_torque=motion.quiet_torque - along.reshape(motion.torque.shape)))
+    return found
+
+
+def _fluctuates(left: FloatArray, usable: BoolArray, rate: float) -> BoolArray:
+    """Which channels of a balance (T, 3) at a rate [Hz] fluctuate as errors do, and not as what a robot's motion makes."""
+    width = max(round(SLOW * rate), 3)
+    here = usable[:, None].astype(float)
+    mean = ndimage.uniform_filter1d(left * here, width, axis=0, mode="constant")
+    mean /= np.maximum(ndimage.uniform_filter1d(here, width, axis=0, mode="constant"), 1.0 / width)
+    fast, total = (np.sum((values * here) ** 2, axis=0) for values in (left - mean, left))
+    found: BoolArray = fast > FLUCTUATES * (1.0 - 1.0 / width) * total
     return found
 
 
