@@ -32,7 +32,7 @@ INSTRUMENTS = ("chassis.", "module.", "wheel.inertia", "rotors.", "suspension.",
 FRICTION_SPEED = 0.05  # [rad/s], at which dry friction reverses
 RIDGE = 1e-6  # of what a number explains, so that numbers which are the same thing share it
 SLOW = 0.4  # [s]; errors fluctuate faster than robots move, and than most of what depends on how they move
-FLUCTUATES = 0.75  # of what white errors have there, as a part of their mean square, errors have at least so much
+FLUCTUATES = 0.75  # of the part that is faster in white errors; of what holds less of it, missing physics is a part
 LEAST_ROWS = 200  # of the balance; fewer tell no errors from masses and frictions
 
 
