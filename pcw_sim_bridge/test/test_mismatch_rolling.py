@@ -13,7 +13,7 @@ import pytest
 from pcw_description import RobotDescription, load_robot
 from pcw_description.column_mapping import ColumnMapping, load_column_mapping
 from pcw_description.import_columns import import_columns
-from pcw_description.robot_description import DRIVE
+from pcw_description.robot_description import DRIVE, STEER
 from pcw_sim_bridge.mismatch import rolling_cases
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.robot_motion import base_pose
@@ -24,6 +24,7 @@ RECORDINGS = Path(__file__).parents[1] / "config" / "recordings"
 # In the recording with the published numbers: the steering of this robot stands so far from its counter's zero.
 PUBLISHED_OFFSET, OFFSET_MARGIN = -0.051, 0.005  # [rad]
 RADIUS_MARGIN = 0.02
+SWING_PHASE = 0.6  # [rad]
 Made = tuple[RobotDescription, Path]  # as it is described, and the recording
 
 
@@ -111,7 +112,7 @@ def test_patched_with_what_was_found_nothing_is_left(real: Callable[..., Path]) 
 
 
 def made_tricycle(
-    path: Path, seed: int, steer_offset: float = 0.0, radius_error: float = 0.0, eccentricity: float = 0.0
+    path: Path, seed: int, steer_offset: float = 0.0, radius_error: float = 0.0, eccentricity: float = 0.0, swing: float = 0.0
 ) -> Made:
     """A tricycle that differs from its description within its tolerances, and by a fault; description and recording."""
     described, rng = tricycle(), np.random.default_rng(seed)
@@ -130,6 +131,7 @@ def made_tricycle(
     joints, pose = rolling_cases.tricycle_motion(wheelbase, radius, 60.0, rng)
     roll = joints[:, 0, DRIVE].copy()
     joints[:, 0, DRIVE] -= eccentricity / radius * np.sin(roll)  # to first order, of a radius that swings by its cosine
+    joints[:, 0, STEER] += swing * np.sin(joints[:, 0, STEER] + SWING_PHASE)
     return described, rolling_cases.write(path, true, joints, pose, rng, {"front": zero})
 
 
@@ -176,6 +178,16 @@ def test_a_wheel_that_runs_out_of_true_is_told_from_all_but_its_encoder(seed: in
     analysis = analysed(*made_tricycle(tmp_path / "bag", seed, eccentricity=0.003))
     (effect,) = analysis.findings.effects
     assert {effect.name, *effect.ambiguous_with} == {"wheel_eccentricity", "encoder_eccentricity"}
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_the_encoder_of_a_steering_that_turns_by_a_third_of_a_turn_is_no_zero(seed: int, tmp_path: Path) -> None:
+    """It was not asked for below half a turn: a zero offset was named in its place, for sure."""
+    analysis = analysed(*made_tricycle(tmp_path / "bag", seed, swing=0.04))
+    assert named(analysis) == ["encoder_eccentricity/front"]
+    estimates = analysis.findings.effects[0].parameters
+    assert estimates["amplitude"].low < 0.04 < estimates["amplitude"].high
+    assert estimates["phase"].value == pytest.approx(SWING_PHASE, abs=0.3)
 
 
 @pytest.mark.parametrize(

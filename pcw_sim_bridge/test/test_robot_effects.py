@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulat
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_effects import _flank, _lagging
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST, _TermMaker
+from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS, DYROS = load_robot("thesis"), load_robot("dyros_pcv")
@@ -169,16 +168,6 @@ def test_more_friction_is_no_more_scrub(tmp_path: Path) -> None:
     print(f"{estimate.value:.5g} ({estimate.low:.5g} to {estimate.high:.5g})")
     assert estimate.low < radius < estimate.high
     assert estimate.value == pytest.approx(radius, rel=0.05)
-
-
-def test_an_error_once_per_turn_is_tried_on_all_encoders_if_one_of_them_turns_enough() -> None:
-    """The same error on four was not tried, because one of them had turned by 3 rad: nothing was named."""
-    reached = np.array([4.0, 5.0, 3.5, 3.0])
-    position = np.zeros((50, 4, 2))
-    position[:, :, 1] = np.linspace(0.0, 1.0, 50)[:, None] * reached
-    maker = SimpleNamespace(robot=THESIS, differences=SimpleNamespace(motions=[SimpleNamespace(position=position)]))
-    for names, turns in ((THESIS.caster_names, True), (THESIS.caster_names[:1], True), (THESIS.caster_names[3:], False)):
-        assert _TermMaker._turns(maker, names, "steer") == turns  # type: ignore[arg-type]
 
 
 def test_play_lies_where_it_lay_while_next_to_no_torque_passes():

@@ -37,7 +37,6 @@ from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, wi
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 
 DIRECTIONS = 8  # of a grid over all directions
-HALF_A_TURN = math.pi  # [rad]
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
@@ -197,9 +196,6 @@ class _TermMaker:
             return None
         if not (self.layout.balanced or self.layout.imu) and target == ("chassis",):
             return None  # loads and slopes would show as what tyres slip under forces that nobody measured
-        swings = isinstance(effect, EncoderEffect) and any(p.is_direction for p in effect.parameters if p not in searched)
-        if swings and not self._turns(target, axis or effect.axis):
-            return None
         if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):
             return None
         neutral = {p.name: self._neutral(p, target) for p in searched}
@@ -328,12 +324,6 @@ class _TermMaker:
         """Whether an effect on contacts shows in how wheels roll, whatever the forces: by where they are in their turn."""
         searched = effect.searched_parameters
         return any(p.is_direction for p in effect.parameters if p not in searched) and not _look_of(effect)
-
-    def _turns(self, target: Sequence[str], axis: str) -> bool:
-        """Whether one of these joints turns far enough to tell what swings once per turn from a zero and a scale."""
-        joints = [(self.robot.caster_index(name), AXIS_NAMES.index(axis)) for name in target]
-        angles = np.concatenate([np.stack([m.position[:, i, k] for i, k in joints]) for m in self.differences.motions], axis=1)
-        return bool(np.ptp(angles, axis=1).max() > HALF_A_TURN)
 
     def _neutral(self, parameter: EffectParameter, target: Sequence[str]) -> float:
         """Value at which the parameter changes nothing; NaN where that is another one for every target."""
