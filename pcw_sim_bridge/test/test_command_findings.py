@@ -112,6 +112,23 @@ def test_one_joint_at_fault_is_named_alone():
     assert {place.casters for place in findings.locations} == {effect.target for effect in effects}
 
 
+@pytest.mark.parametrize("lagging", [slice(None), slice(0, 1)])
+def test_what_no_joint_says_clearly_enough_all_of_them_may(lagging):
+    """Of gentle motion each of four steerings had 3 nats for a lag, none was named, and nothing was missing."""
+    robot = load_robot("tidybot2")
+    effect = EffectInstance("actuator_lag", robot.caster_names[lagging], {"time_constant": 0.006}, "steer")
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "figure8", 21.0, 3), [effect])
+    findings = command_findings(command_problems(robot, [recording]), (), 0, None, lambda message: None)
+    if len(effect.target) < robot.n:
+        assert findings.named == ()
+        return
+    [(named, instance)] = findings.named
+    assert (instance.name, instance.target, instance.axis) == (effect.name, robot.caster_names, "steer")
+    estimate = named.estimates["time_constant"]
+    assert estimate.low < 0.006 < estimate.high < 0.01
+    assert named.probability > 0.9 and named.loss > 9.0
+
+
 def test_nothing_is_named_where_commands_are_followed():
     assert found().named == ()
 

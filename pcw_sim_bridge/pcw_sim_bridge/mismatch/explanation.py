@@ -316,10 +316,18 @@ def _tolerated(search: EffectSearch, selection: Selection) -> int | None:
     return None
 
 
-def explanation_by(explanation: Explanation, instances: Sequence[Instance]) -> Explanation:
-    """Return the explanation by these effects alone: fitted again, and what is left tested again."""
+def explanation_by(explanation: Explanation, instances: Sequence[Instance], known: bool = False) -> Explanation:
+    """Return the explanation by these effects alone: fitted again, and what is left tested again.
+
+    Args:
+        explanation: of the same problem.
+        instances: effects.
+        known: whether they are there whatever this problem says, as others know of them.
+    """
     search, threshold = explanation.search, explanation.selection.threshold
-    selection = search.balanced(search.bounded(search.retuned_away(search.conclude(instances, threshold))))
+    selection = search.conclude(instances, threshold)
+    if not known:
+        selection = search.balanced(search.bounded(search.retuned_away(selection)))
     instances = selection.fit.instances
     result = OpenSetTest(search, selection.fit.instances).run(threshold)
     return dataclasses.replace(
