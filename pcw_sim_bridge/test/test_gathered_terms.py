@@ -3,9 +3,15 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from pcw_description import load_robot
+from pcw_description.effect_instance import EffectInstance
+from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.gathered_terms import gatherings
 from pcw_sim_bridge.mismatch.regression_problem import LinearParameter, Term
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
 ALL = ("a", "b", "c")
@@ -48,3 +54,21 @@ def test_a_payload_at_the_wrong_place_and_what_makes_up_for_it_may_be_one_payloa
     """Its place is searched; without that, either says what the other cannot."""
     assert offered(8, 9) == [([], [9])]
     assert offered(8, 6) == []
+
+
+@pytest.mark.parametrize(("radii", "found"), [((7.6e-3,) * 4, 1), ((7.6e-3, 5.0e-3, 7.6e-3, 7.6e-3), 4)])
+def test_casters_that_scrub_alike_are_one_fault_of_all_also_where_each_was_found_exactly(radii, found):
+    """From where the problem is exact with four of them, one on all in their place explains nothing to first order."""
+    robot = load_robot("dyros_pcv")
+    effects = [
+        EffectInstance("scrub_torque", (name,), {"radius": radius})
+        for name, radius in zip(robot.caster_names, radii, strict=True)
+    ]
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "random_goals", 20.0, 3), effects)
+    problem = RobotProblemBuilder(robot, [recording]).build()
+    single = [k for k, term in enumerate(problem.terms) if term.effect == "scrub_torque" and len(term.target) == 1]
+    search = EffectSearch(problem, np.random.default_rng(0))
+    threshold = search.settings.smallest_threshold
+    each = search.settle_on(search.conclude([Instance(k, (), (0,)) for k in single], threshold), threshold)
+    assert len(each.fit.instances) == robot.n
+    assert len(search.gathered(each).fit.instances) == found

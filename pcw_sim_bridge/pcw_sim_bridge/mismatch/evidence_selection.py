@@ -24,11 +24,12 @@ from pcw_description.effects.registry import all_effects
 
 from .effect_gates import EffectGates
 from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
+from .gathered_terms import gatherings
 from .noise_model import SLOW_ORDINATES
 from .outline_search import Outlines, has_outline, reaching, searched_outline
 from .regression_problem import HEALTHY, FloatArray, RegressionProblem, segment_slices
 from .selection_settings import SelectionSettings
-from .set_growth import LadderStep, Progress, SetGrowth
+from .set_growth import GATHERED_AMONG, LadderStep, Progress, SetGrowth
 from .shape_search import DROP, refined_shape
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
@@ -114,7 +115,7 @@ class EffectSearch(SetGrowth):
                 break
         threshold = self.calibrate(regression, instances)
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
-        selection = self.against_alike(self.against_fewer(self.with_best_waves(selection)))
+        selection = self.against_alike(self.against_fewer(self.with_best_waves(self.gathered(selection))))
         return self.with_outlines(self.bounded(self.retuned_away(selection)))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
@@ -193,6 +194,27 @@ class EffectSearch(SetGrowth):
         self.note_drop(self.label(instances[index]), selection.losses[index], "beyond its bounds")
         others = instances[:index] + instances[index + 1 :]
         return self.bounded(self.retuned_away(self.prune(self.whiten_beside(others), others, selection.threshold)))
+
+    def gathered(self, selection: Selection) -> Selection:
+        """Exchange the same effect on several casters for one on all of these, where that does more from the description on.
+
+        Where the problem is exact with each of them at work, the one on all does next to nothing in their place.
+        """
+        instances = selection.fit.instances
+        here, own = (self.problem, self._point), None
+        for others, wider in gatherings(self.problem, instances):
+            own = self._exact_evidence(selection.regression, selection.fit) if own is None else own
+            described = selection.regression.moved(self.description)
+            for candidate in described.scan(others, only=wider)[0][:GATHERED_AMONG]:
+                self.problem, self._point = self.description, None
+                one = self.made_exact((*others, refined_shape(described, others, candidate.instance)))
+                regression = selection.regression.moved(self.problem)
+                gain = self._exact_evidence(regression, regression.fit(one)) - own
+                if gain > STEADY_EVIDENCE:
+                    self.progress(f"gather into {self.label(one[-1])}, from the description on: {gain:.1f} nats")
+                    return self.settle_on(self.conclude(one, selection.threshold), selection.threshold)
+        self.problem, self._point = here
+        return selection
 
     def against_fewer(self, selection: Selection) -> Selection:
         """Exchange a set for a smaller one that does as well from the description on.
