@@ -379,6 +379,23 @@ def test_a_small_effect_that_no_error_of_the_model_looks_like_counts(drift, name
     assert chosen(dataclasses.replace(problem, drifts=drifts)) == named
 
 
+@pytest.mark.parametrize("size", [0.0, 0.05])
+def test_what_comes_nearest_to_a_name_is_told(size):
+    """49 nats were refused for what the model itself misjudges, and no word of them stood beside "nothing is missing"."""
+    time = np.arange(3000) / RATE
+    noise = 0.01 * np.random.default_rng(4).standard_normal(len(time))
+    column = np.sin(7.0 * time)
+    problem = linear_problem(size * column + noise, {"ripple": (column, 100.0)})
+    explanation = explain(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    nearest = explanation.nearest()
+    assert explanation.named == ()
+    if size == 0.0:
+        assert nearest is None
+    else:
+        assert nearest is not None and "ripple" in nearest.description and nearest.gain > 9.0
+        assert nearest.outcome == "below the details that remain"
+
+
 def test_what_a_gate_stops_gives_way_to_its_like_that_passes():
     """Two columns do nearly the same. That which does more holds the residual's noise and is less than that: no finding."""
     time = np.arange(3000) / RATE

@@ -365,6 +365,11 @@ def _notes(
     strained = strained_of_the_balance(problem, explanation.fit)
     if doubted and strained:
         notes.append(f"{', '.join(doubted)} may stand for what {', '.join(strained)} show to be missing: half as sure.")
+    if not explanation.named and not unfinished and not proof.dropped:
+        nearest = explanation.nearest()
+        if nearest is not None:
+            effect = nearest.description.removeprefix("drop ")
+            notes.append(f"Nearest to an effect came {effect}: {nearest.gain:.0f} nats, but {nearest.outcome}.")
     if not has_holdout:
         notes.append(
             "No hold-out recording was given: the proof leaves out manoeuvres of the fitted ones, which the choice of the "

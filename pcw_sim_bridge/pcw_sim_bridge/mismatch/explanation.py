@@ -41,7 +41,7 @@ from .regression_problem import (
     Term,
 )
 from .selection_settings import SelectionSettings
-from .set_growth import Progress
+from .set_growth import LadderStep, Progress
 from .shape_search import DROP, refined_shape, shape_interval
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
@@ -156,6 +156,12 @@ class Explanation:
     def complete(self) -> bool:
         """Whether nothing is left."""
         return not self.leftovers
+
+    def nearest(self) -> LadderStep | None:
+        """What explained most of all that was refused although it explained enough for a name; None if nothing did."""
+        steps = self.selection.ladder
+        refused = [step for step in steps if step.description.startswith("drop ") and step.gain >= self.selection.threshold]
+        return max(refused, key=lambda step: step.gain, default=None)
 
 
 def explain(
