@@ -338,13 +338,19 @@ def test_an_effect_misleads_simulations_by_all_horizons_and_not_by_one(with_it: 
     )
     windows = Windows(("speed",), np.zeros(60, dtype=np.int64), 2.0 * np.arange(60), np.ones_like(spread), (((0, 1.0),),), ())
     prover = SimpleNamespace(
-        before=nominal, rng=rng, tuned=False, _quiet_windows=lambda explanation: windows,
+        before=nominal, rng=rng, untuned=frozenset({"mass"}), _quiet_windows=lambda explanation: windows,
         _simulation_tells=lambda explanation, instance: True, _rollout=lambda explanation, held_out, index: without,
     )
     prover._harms = functools.partial(Prover._harms, prover)
     held_out = SimpleNamespace(proposed=(0,), instances=(Instance(0, (), (0,)),))
     found = Prover._misleading(prover, SimpleNamespace(), held_out, after)  # type: ignore[arg-type]
     assert (found is not None) == misleads
+
+
+def retunable(*names: str) -> SimpleNamespace:
+    """An explanation of a problem with such numbers of a description."""
+    numbers = tuple(SimpleNamespace(name=name) for name in names)
+    return SimpleNamespace(search=SimpleNamespace(problem=SimpleNamespace(nuisances=numbers)))
 
 
 @pytest.mark.parametrize(("alone", "misleads"), [(0.5, False), (1.2, True)])
@@ -354,16 +360,16 @@ def test_an_effect_is_not_blamed_for_the_numbers_beside_it(alone: float, mislead
     spread = rng.uniform(0.9, 1.1, size=(60, len(HORIZONS), 1))
     windows = Windows(("speed",), np.zeros(60, dtype=np.int64), 2.0 * np.arange(60), np.ones_like(spread), (((0, 1.0),),), ())
     prover = SimpleNamespace(
-        before=spread, rng=rng, tuned=True, _quiet_windows=lambda explanation: windows,
+        before=spread, rng=rng, untuned=frozenset(), _quiet_windows=lambda explanation: windows,
         _simulation_tells=lambda explanation, instance: True,
     )
     errors = {(True, True): 1.3, (True, False): 0.8, (False, True): alone, (False, False): 1.0}
-    prover._rollout = lambda explanation, held_out, without=None: spread * errors[prover.tuned, without is None] ** 2
+    prover._rollout = lambda explanation, held_out, without=None: spread * errors[not prover.untuned, without is None] ** 2
     prover._harms = functools.partial(Prover._harms, prover)
     held_out = SimpleNamespace(proposed=(0,), instances=(Instance(0, (), (0,)),))
-    found = Prover._misleading(prover, SimpleNamespace(), held_out, spread * 1.3**2)  # type: ignore[arg-type]
+    found = Prover._misleading(prover, retunable("chassis.mass"), held_out, spread * 1.3**2)  # type: ignore[arg-type]
     assert (found is not None) == misleads
-    assert prover.tuned
+    assert not prover.untuned
 
 
 @pytest.mark.parametrize(("size", "stays"), [(0.5, True), (1.0, True), (2.2, False)])
@@ -373,20 +379,21 @@ def test_effects_that_only_make_up_for_numbers_far_off_are_no_patch(size: float,
     Alone it does a half of what is missing, or all of it, or overshoots by more than is missing; the mass helps nothing.
     """
     true, mass = np.sin(np.arange(400.0))[:, None], np.cos(np.arange(400.0))[:, None]
-    problem = SimpleNamespace(residual=true, nominal_residual=true)
+    explanation = retunable("chassis.mass")
+    problem = SimpleNamespace(residual=true, nominal_residual=true, nuisances=explanation.search.problem.nuisances)
     held_out = SimpleNamespace(
         proposed=(0,), instances=(Instance(0, (), (0,)),), nuisances=1, problem=problem,
         means=lambda: np.array([[1.5, size]]), predicted=lambda means: mass * means[0, 0] + true * means[0, 1],
         help_of=lambda index: (40.0, 50.0),
     )
     prover = SimpleNamespace(
-        _is_patched=lambda explanation: True,
+        _is_patched=lambda explanation: True, _simulates_worse=lambda explanation, after: False, before=None,
         _error=lambda explanation, held_out, predicted: float(np.mean((held_out.problem.residual - predicted) ** 2)),
     )
-    prover.tuned = Prover._numbers_help(prover, SimpleNamespace(), held_out, None)  # type: ignore[arg-type]
+    prover.untuned = Prover._not_helping(prover, explanation, held_out, None)  # type: ignore[arg-type]
     prover._prediction = functools.partial(Prover._prediction, prover)
-    found = Prover._no_better(prover, SimpleNamespace(), held_out)  # type: ignore[arg-type]
-    assert not prover.tuned
+    found = Prover._no_better(prover, explanation, held_out)  # type: ignore[arg-type]
+    assert prover.untuned == {"chassis.mass"}
     assert (found is None) == stays
     assert found is None or found[0] == 0
 
@@ -395,19 +402,50 @@ def test_effects_that_only_make_up_for_numbers_far_off_are_no_patch(size: float,
 def test_an_effect_is_no_patch_without_numbers_that_it_needs(astray: bool) -> None:
     """More than twice of what is missing, and a number that takes the rest back, but leads simulations astray."""
     true = np.sin(np.arange(400.0))[:, None]
+    explanation = retunable("chassis.mass")
+    problem = SimpleNamespace(residual=true, nominal_residual=true, nuisances=explanation.search.problem.nuisances)
     held_out = SimpleNamespace(
-        proposed=(0,), instances=(Instance(0, (), (0,)),), nuisances=1,
-        problem=SimpleNamespace(residual=true, nominal_residual=true),
+        proposed=(0,), instances=(Instance(0, (), (0,)),), nuisances=1, problem=problem,
         means=lambda: np.array([[-1.2, 2.2]]), predicted=lambda means: true * means.sum(), help_of=lambda index: (40.0, 50.0),
     )
     prover = SimpleNamespace(
-        _is_patched=lambda explanation: True, _simulates_worse=lambda explanation, after: astray,
+        _is_patched=lambda explanation: True, _simulates_worse=lambda explanation, after: astray, before=None,
         _error=lambda explanation, held_out, predicted: float(np.mean((held_out.problem.residual - predicted) ** 2)),
     )
-    prover.tuned = Prover._numbers_help(prover, SimpleNamespace(), held_out, None)  # type: ignore[arg-type]
+    prover.untuned = Prover._not_helping(prover, explanation, held_out, None)  # type: ignore[arg-type]
     prover._prediction = functools.partial(Prover._prediction, prover)
-    assert prover.tuned is not astray
-    assert (Prover._no_better(prover, SimpleNamespace(), held_out) is not None) is astray  # type: ignore[arg-type]
+    assert bool(prover.untuned) is astray
+    assert (Prover._no_better(prover, explanation, held_out) is not None) is astray  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("astray", "left_out"),
+    [((), set()), (("chassis.",), {"chassis.mass"}), (("chassis.", "contact."), {"chassis.mass", "contact.mu_p"}),
+     (("torque_lag",), {"chassis.mass", "contact.mu_p", "torque_lag"})],
+)  # fmt: skip
+def test_only_numbers_that_lead_a_simulation_astray_stay_as_described(astray: tuple[str, ...], left_out: set[str]) -> None:
+    """Of 49 numbers five masses made a simulation worse; without the rest a quarter of the gap was closed, with it all."""
+    explanation = retunable("chassis.mass", "contact.mu_p", "torque_lag")
+    numbers = explanation.search.problem.nuisances
+    true = np.sin(np.arange(400.0))[:, None]
+    problem = SimpleNamespace(residual=true, nominal_residual=true, nuisances=numbers)
+    held_out = SimpleNamespace(
+        nuisances=len(numbers), problem=problem, means=lambda: np.full((1, len(numbers)), 0.2),
+        predicted=lambda means: true * means.sum(),
+    )
+
+    def simulated(prover: SimpleNamespace) -> float:
+        return 1.0 + sum(n.name.startswith(astray) for n in numbers if n.name not in prover.untuned) if astray else 1.0
+
+    prover = SimpleNamespace(
+        _is_patched=lambda explanation: True, before=np.ones(1), untuned=frozenset(),
+        _simulates_worse=lambda explanation, after: after > 1.0, _simulated_error=lambda explanation, after: after,
+        _rollout=lambda explanation, held_out: simulated(prover),
+        _error=lambda explanation, held_out, predicted: float(np.mean((held_out.problem.residual - predicted) ** 2)),
+    )
+    first = simulated(prover)
+    assert Prover._not_helping(prover, explanation, held_out, first) == left_out  # type: ignore[arg-type]
+
 
 
 @pytest.mark.parametrize(("part", "speaks_for_it"), [(1.0, True), (0.4, True), (0.1, False)])
@@ -457,8 +495,8 @@ def test_a_small_law_that_other_data_contradict_is_no_finding(
         _useless=lambda explanation, held_out: says(prover, "errors"),
         _misleading=lambda explanation, held_out, after: says(prover, "simulation"),
         _no_better=lambda explanation, held_out: None, _is_patched=lambda explanation: False,
-        _numbers_help=lambda explanation, held_out, after: True,
-        _remarks=lambda *rest: [], _finding=lambda *rest: None, tuned=True,
+        _not_helping=lambda explanation, held_out, after: frozenset(),
+        _remarks=lambda *rest: [], _finding=lambda *rest: None, untuned=frozenset(),
     )
     monkeypatch.setattr(proof, "_of_description", lambda problem: np.zeros(1))
     result = Prover.prove(prover, explanation)  # type: ignore[arg-type]

@@ -134,7 +134,7 @@ def analyse(
     everything = [*((named, _instance(named)) for named in explanation.named), *commands.named]
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
-    numbers = _reported_numbers(explanation) if proof.tuned else {}
+    numbers = {name: value for name, value in _reported_numbers(explanation).items() if name not in proof.untuned}
     patched = subject.patched(instances, numbers) if instances else subject
     leftovers = (*explanation.leftovers, *commands.leftovers)
     unknown = _unknown(leftovers, proof.laws, [str(path) for path in fit])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -41,6 +41,12 @@ LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 ALLOWED_HARM = 0.01
 # Part of what no name explained from which a law is told of though other data contradict it.
 MOST_OF_IT = 0.5
+# Kinds of numbers that move a simulated robot, by how their names begin. One kind may lead it astray, and foretell its own
+# channels well: what is wrong with the forces of tyres and bodies is put into masses.
+KINDS = (
+    ("chassis.", "module.", "wheel.inertia", "rotors."), ("torque_constant/",), ("contact.",),
+    ("wheel_radius", "caster_offset", "steer_axis", "steer_zero"),
+)  # fmt: skip
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
 
@@ -56,7 +62,7 @@ class Proof:
         explanation: with the effects that stay.
         finding: errors before and after.
         held_out: what was judged; predicted: what the fits take of its residual (T, C).
-        tuned: whether re-tuned numbers go into the patch beside the effects.
+        untuned: re-tuned numbers that stay in the patch as they are described.
         laws: those outside the library that are part of the patch.
         dropped: ladder lines of the effects that do not help.
         notes: what a reader has to know of the proof.
@@ -66,7 +72,7 @@ class Proof:
     finding: FitFinding
     held_out: HeldOut
     predicted: FloatArray
-    tuned: bool
+    untuned: frozenset[str]
     laws: tuple[Law, ...]
     dropped: tuple[LadderFinding, ...]
     notes: tuple[str, ...]
@@ -126,8 +132,8 @@ class Prover:
         if self.windows is not None and not len(self.windows.begin):
             self.windows = None
         self.before = None if self.windows is None else subject.rollout(self.windows)
-        # Whether numbers of the description that were re-tuned go into the patch, too.
-        self.tuned = True
+        # Numbers of the description that were re-tuned, and do not go into the patch all the same.
+        self.untuned: frozenset[str] = frozenset()
         self.laws: LawModels
 
     def prove(self, explanation: Explanation, besides: bool = False) -> Proof:
@@ -146,7 +152,7 @@ class Prover:
         refused: set[Instance] = set()
         contradicted: list[Law] = []
         while True:
-            self.tuned = True
+            self.untuned = frozenset()
             self.laws = LawModels(explanation, refused)
             held_out = self._held_out(explanation)
             after = None
@@ -154,7 +160,7 @@ class Prover:
             if useless is None:
                 after = self._rollout(explanation, held_out)
                 simulated = self._misleading(explanation, held_out, after)
-                self.tuned = self._numbers_help(explanation, held_out, after)
+                self.untuned = self._not_helping(explanation, held_out, after)
                 useless = simulated or self._no_better(explanation, held_out)
             if useless is None:
                 break
@@ -172,10 +178,13 @@ class Prover:
         predicted = _of_description(held_out.problem)
         if self._is_patched(explanation):
             predicted = self._prediction(held_out)
-            if not self.tuned:
+            if self.untuned:
                 after = self._rollout(explanation, held_out)
+                stay = sorted(self.untuned & self.retune(explanation).keys())
+                which = "" if self.untuned == _names(explanation) else f" {', '.join(stay)}"
                 notes.append(
-                    "The description's numbers as re-tuned beside the effects do not help held out: in the patch they stay."
+                    f"The description's numbers{which} as re-tuned beside the effects do not help held out: in the patch they "
+                    "stay."
                 )
         # A small part of what was left, which forces and slips of other data contradict, is a detail of what was fitted; most
         # of it was there. A simulation that goes astray says less: the law may be the wrong one for something that is there.
@@ -187,18 +196,46 @@ class Prover:
         notes += self._remarks(explanation, held_out, after)
         finding = self._finding(explanation, held_out, predicted, after)
         laws = tuple(self.laws.laws.values())
-        return Proof(explanation, finding, held_out, predicted, self.tuned, laws, tuple(dropped), tuple(notes))
+        return Proof(explanation, finding, held_out, predicted, self.untuned, laws, tuple(dropped), tuple(notes))
 
-    def _numbers_help(self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None) -> bool:
-        """Whether numbers of the description as re-tuned beside the effects help held out, and lead no simulation astray."""
+    def _not_helping(self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None) -> frozenset[str]:
+        """Re-tuned numbers that do not help held out or lead a simulation astray, of as few kinds as there are."""
+        everything = _names(explanation)
         if not self._is_patched(explanation):
-            return True
-        errors = [self._error(explanation, held_out, prediction) for prediction in _with_and_without_numbers(held_out)]
-        return errors[0] <= errors[1] and not self._simulates_worse(explanation, after)
+            return frozenset()
+        bare = self._error(explanation, held_out, _predicted_without(held_out, everything))
+
+        def helps(left_out: frozenset[str], simulated: FloatArray | None) -> bool:
+            own = self._error(explanation, held_out, _predicted_without(held_out, left_out))
+            return own <= bare and not self._simulates_worse(explanation, simulated)
+
+        left_out: frozenset[str] = frozenset()
+        kinds = [kind for k in KINDS if (kind := frozenset(name for name in everything if name.startswith(k)))]
+        while not helps(left_out, after):
+            trials = []
+            for kind in kinds if self.before is not None and after is not None else []:
+                self.untuned = left_out | kind
+                simulated = self._rollout(explanation, held_out)
+                trials.append((self._simulated_error(explanation, simulated), kind, simulated))
+            if not trials:
+                left_out = everything
+                break
+            _, kind, after = min(trials, key=lambda trial: trial[0])
+            kinds.remove(kind)
+            left_out |= kind
+        return left_out
+
+    def _simulated_error(self, explanation: Explanation, after: FloatArray | None) -> float:
+        """Mean square of what a patched description leaves of all signals at the main horizon; infinite where nothing is."""
+        windows = self._quiet_windows(explanation)
+        if windows is None or self.before is None or after is None:
+            return math.inf
+        errors = _rollout_errors(windows, self.before, after, self.rng, [MAIN_HORIZON]).pooled()
+        return float(errors.after[0]) if len(errors.judged) else math.inf
 
     def _prediction(self, held_out: HeldOut) -> FloatArray:
-        """What the patch takes of the held-out residual (T, C), with re-tuned numbers if they go into it."""
-        return _with_and_without_numbers(held_out)[0 if self.tuned else 1]
+        """What the patch takes of the held-out residual (T, C), with the re-tuned numbers that go into it."""
+        return _predicted_without(held_out, self.untuned)
 
     def _simulates_worse(self, explanation: Explanation, after: FloatArray | None) -> bool:
         """Whether the patched description is followed less well than the nominal one, all signals together."""
@@ -216,7 +253,7 @@ class Prover:
 
     def _numbers(self, explanation: Explanation) -> Mapping[str, float]:
         """Numbers of the description that go into the patch."""
-        return self.retune(explanation) if self.tuned else {}
+        return {name: value for name, value in self.retune(explanation).items() if name not in self.untuned}
 
     def _error(self, explanation: Explanation, held_out: HeldOut, predicted: FloatArray) -> float:
         """Mean squared relative error of all channels, each counted by how far it can be foretold."""
@@ -290,10 +327,10 @@ class Prover:
         Numbers that are re-tuned beside an effect may lead a simulation astray that the effect alone does not.
         """
         harms = self._harms(explanation, held_out, after)
-        if self.tuned and max(harms.values(), default=0.0) > 0.0:
-            self.tuned = False
+        if not self.untuned and max(harms.values(), default=0.0) > 0.0:
+            self.untuned = _names(explanation)
             alone = self._harms(explanation, held_out, self._rollout(explanation, held_out))
-            self.tuned = True
+            self.untuned = frozenset()
             harms = {index: min(harm, alone.get(index, harm)) for index, harm in harms.items()}
         index = max(harms, key=lambda k: harms[k], default=0)
         return (index, "the simulation follows less well with it") if harms.get(index, 0.0) > 0.0 else None
@@ -520,12 +557,17 @@ def _of_description(problem: RegressionProblem) -> FloatArray:
     return problem.residual - problem.nominal_residual
 
 
-def _with_and_without_numbers(held_out: HeldOut) -> list[FloatArray]:
-    """What the fits take of the residual (T, C), with the numbers re-tuned beside the effects, and with those of the file."""
-    means = held_out.means()
-    bare = means.copy()
-    bare[:, : held_out.nuisances] = 0.0
-    return [held_out.predicted(numbers) for numbers in (means, bare)]
+def _predicted_without(held_out: HeldOut, left_out: Collection[str]) -> FloatArray:
+    """What the fits take of the residual (T, C), some numbers of the description by name as it states them."""
+    means = held_out.means().copy()
+    stays = [number.name in left_out for number in held_out.problem.nuisances]
+    means[:, : held_out.nuisances][:, stays] = 0.0
+    return held_out.predicted(means)
+
+
+def _names(explanation: Explanation) -> frozenset[str]:
+    """Names of all numbers of the description that may be re-tuned."""
+    return frozenset(number.name for number in explanation.search.problem.nuisances)
 
 
 def _shares(explanation: Explanation, problem: RegressionProblem) -> FloatArray:
