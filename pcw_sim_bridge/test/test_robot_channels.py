@@ -13,7 +13,7 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, used_friction
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, sliding, used_friction
 from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
 from pcw_sim_bridge.mismatch.rolling_model import ChannelLayout, ModelNumbers
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -67,6 +67,24 @@ def test_zeros_as_numbers_and_as_effects_are_one_thing_also_where_nothing_tracks
     sizes = [float(np.sqrt(np.mean(values[valid, :2] ** 2))) for values in (problem.residual, left, left - other.residual)]
     print(f"rms forces: undescribed {sizes[0]:.3g}, tuned {sizes[1]:.3g}, difference from described {sizes[2]:.3g} N")
     assert sizes[2] < 0.02 * sizes[1]
+
+
+def test_wheels_that_spin_all_together_are_told_by_what_else_feels_the_motion(tmp_path: Path) -> None:
+    """No wheel contradicted the others when all of them turned about at once: half a second was all of the error."""
+    builder = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 4)])
+    [motion] = builder.motions
+    before = sliding(builder.numbers, motion, builder.layout)
+    spinning = (motion.time > 8.0) & (motion.time < 8.4)
+    assert not before[spinning].any()
+    for name, column, size in (("imu", 0, 1.2), ("tracked_twist", 2, 1.2), ("tracked_twist", 0, 0.5)):
+        felt = getattr(motion, name).copy()
+        felt[spinning, column] += size
+        found = sliding(builder.numbers, dataclasses.replace(motion, **{name: felt}), builder.layout)
+        assert found[spinning].mean() > 0.9
+        assert np.mean(found[~spinning] & ~before[~spinning]) < 0.01
+    # A gyro with an offset, or that is off by a tenth, parts from the wheels all the time.
+    felt = motion.imu * np.array([1.1, 1.0, 1.0]) + np.array([0.1, 0.0, 0.0])
+    np.testing.assert_array_equal(sliding(builder.numbers, dataclasses.replace(motion, imu=felt), builder.layout), before)
 
 
 @pytest.mark.parametrize("plant", ["reduced", "pybullet"])

@@ -44,6 +44,7 @@ from .torque_errors import with_balanced_torques
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
 SLIP_FLOOR, SLIP_PART = 0.03, 0.75
+GROSS = 3.0  # times that; a tracker or a gyro that parts from all wheels by so much at once says that these spin
 # Part of a tyre's friction up to which its force says how much it slips: at the peak any slip goes with the same force.
 USED_PART = 0.8
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
@@ -336,11 +337,16 @@ def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -
     """Return the rows (T,) of a motion in which wheels slide, shake, or use so much friction that their slip is open."""
     twist, contradiction = twists(numbers, numbers.headings(motion.position), motion.velocity)
     allowed = allowed_slip(numbers, twist)
+    reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
+    tracked, rolled = motion.tracked_twist, at_place(twist, numbers.tracked)
     if layout.redundant:
         bad: BoolArray = np.max(np.linalg.norm(contradiction, axis=2), axis=1) > allowed
+        # Wheels that spin all together do not contradict each other.
+        bad |= sudden_slip(tracked, rolled, motion.rate, reach, GROSS * allowed)
+        turned = np.column_stack([twist[:, :2], motion.imu[:, 0]])
+        bad |= sudden_slip(turned, twist, motion.rate, reach, GROSS * allowed)
     else:
-        reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
-        bad = sudden_slip(motion.tracked_twist, at_place(twist, numbers.tracked), motion.rate, reach, allowed)
+        bad = sudden_slip(tracked, rolled, motion.rate, reach, allowed)
     bad = bad | (motion.shaking > SHAKING_PART * allowed)
     if layout.balanced:
         bad |= used_friction(numbers, rolling_state(motion, numbers, layout)) > USED_PART
