@@ -69,6 +69,16 @@ class CommandedJoint:
     torque: FloatArray
     rate: FloatArray
 
+    @functools.cached_property
+    def steps(self) -> tuple[float, IntArray]:
+        """Step [s] of the kernels, and how many of them a command was held before each sample (T,).
+
+        At a rate that is no whole part of the controller's these are not the same everywhere: intervals of 3, 3 and 4 ms.
+        """
+        step = self.interval / max(1, int(np.ceil(self.interval / LARGEST_STEP - 1e-6)))
+        intervals = np.diff(self.time, prepend=self.time[0] - self.interval)
+        return step, np.maximum(np.rint(intervals / step), 1).astype(np.int64)
+
 
 @compiled_for_kernel(ARRAY_SIGNATURE, "float64[::1]", "float64[::1], int64, float64[::1], float64[::1], float64, int64[::1]")
 def _torque_along(kernel, values, memory, command, rate, step, steps):  # type: ignore[no-untyped-def]
@@ -88,21 +98,11 @@ def _torque_along(kernel, values, memory, command, rate, step, steps):  # type: 
 
 def through(effect: ActuatorEffect, values: Mapping[str, float], joint: CommandedJoint, command: FloatArray) -> FloatArray:
     """Return the torque (T,) [N m] that an actuator with the effect makes of a command (T,)."""
-    step, steps = _steps(joint)
+    step, steps = joint.steps
     torque: FloatArray = _torque_along(
         effect.drive, effect.values(values), MEMORY + effect.memory(values, step), command, joint.rate, step, steps
     )
     return torque
-
-
-def _steps(joint: CommandedJoint) -> tuple[float, IntArray]:
-    """Step [s] of the kernels, and how many of them a command was held before each sample (T,).
-
-    At a rate that is no whole part of the controller's these are not the same everywhere: intervals of 3, 3 and 4 ms.
-    """
-    step = joint.interval / max(1, int(np.ceil(joint.interval / LARGEST_STEP - 1e-6)))
-    intervals = np.diff(joint.time, prepend=joint.time[0] - joint.interval)
-    return step, np.maximum(np.rint(intervals / step), 1).astype(np.int64)
 
 
 def commanded_joints(
@@ -252,7 +252,7 @@ class _JointProblem:
 
     def _reaching(self) -> list[float]:
         """Times [s] that reach a little into the last step of one of the commonest cycles, or of several one after another."""
-        step, steps = _steps(max(self.pieces, key=lambda piece: len(piece.time)))
+        step, steps = max(self.pieces, key=lambda piece: len(piece.time)).steps
         lengths, counts = np.unique(steps, return_counts=True)
         common = lengths[np.argsort(-counts, kind="stable")[:CYCLES]]
         whole = sorted({int(length * back) for length in common for back in range(1, CYCLES_BACK + 1)})

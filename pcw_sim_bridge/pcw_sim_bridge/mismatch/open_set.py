@@ -18,6 +18,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from scipy import linalg
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
@@ -389,19 +390,22 @@ class OpenSetTest:
         Grown by what so many functions take of mere noise.
         """
         left = self.residual.copy()
-        for channel in range(left.shape[1]):
-            columns = [functions for (c, _), (functions, _) in self.bases.items() if c == channel]
-            valid = self.problem.valid[:, channel]
-            if not columns or not valid.any():
+        columns = {name: functions for (_, name), (functions, _) in self.bases.items()}
+        if not columns:
+            return left
+        stacked = np.concatenate([*columns.values(), np.ones((len(left), 1))], axis=1)
+        masks, mask_of = np.unique(self.problem.valid, axis=1, return_inverse=True)
+        for number, valid in enumerate(masks.T):
+            if not valid.any():
                 continue
-            stacked = np.concatenate([*columns, np.ones((len(left), 1))], axis=1)
+            own = np.flatnonzero(mask_of.ravel() == number)  # channels that are judged at the same samples
             size = np.maximum(np.sqrt(np.mean(stacked[valid] ** 2, axis=0)), 1e-300)
             scaled = stacked[valid] / size
-            plain = scaled.T @ scaled
-            gram = plain + 1e-3 * len(scaled) * np.eye(scaled.shape[1])
-            left[:, channel] -= stacked / size @ np.linalg.solve(gram, scaled.T @ left[valid, channel])
-            freedom = float(np.trace(np.linalg.solve(gram, plain)))
-            left[:, channel] *= np.sqrt(len(scaled) / max(len(scaled) - freedom, 0.1 * len(scaled)))
+            ridge, width = 1e-3 * len(scaled), scaled.shape[1]
+            factor = linalg.cho_factor(scaled.T @ scaled + ridge * np.eye(width))
+            left[:, own] -= stacked / size @ linalg.cho_solve(factor, scaled.T @ left[np.ix_(valid, own)])
+            freedom = width - ridge * float(np.trace(linalg.cho_solve(factor, np.eye(width))))
+            left[:, own] *= np.sqrt(len(scaled) / max(len(scaled) - freedom, 0.1 * len(scaled)))
         return left
 
     def run(self, threshold: float) -> OpenSetResult:

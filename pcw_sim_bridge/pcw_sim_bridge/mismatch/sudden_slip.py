@@ -12,6 +12,7 @@ from scipy import ndimage
 from .regression_problem import BoolArray, FloatArray
 
 USUAL_DURATION = 3.0  # [s]; what stays for half of it is the usual difference
+MEDIAN_RATE = 25.0  # [Hz] at most
 SUDDEN = 6.0  # times what the difference usually departs from that, as the standard deviation of its quiet part
 MEDIAN_OF_NORMAL = 0.6745  # of the absolute value of a standard normal number
 
@@ -27,9 +28,19 @@ def sudden_slip(tracked: FloatArray, rolled: FloatArray, rate: float, reach: flo
     """
     known: BoolArray = np.asarray(np.isfinite(tracked).all(axis=1))
     apart = np.where(known[:, None], tracked - rolled, 0.0)
-    window = min(round(USUAL_DURATION * rate) | 1, len(apart) | 1)
-    departure = apart - ndimage.median_filter(apart, size=(window, 1), mode="nearest")
+    departure = apart - _usually(apart, rate)
     size = np.hypot(departure[:, 0], departure[:, 1]) + reach * np.abs(departure[:, 2])
     usual = float(np.median(size[known])) / MEDIAN_OF_NORMAL if known.any() else 0.0
     found: BoolArray = known & (size > np.maximum(least, SUDDEN * usual))
     return found
+
+
+def _usually(apart: FloatArray, rate: float) -> FloatArray:
+    """Median of the seconds about every sample (T, 3); of fast samples some stand for all."""
+    step = max(1, round(rate / MEDIAN_RATE))
+    some = apart[::step]
+    window = min(round(USUAL_DURATION * rate / step) | 1, len(some) | 1)
+    median = ndimage.median_filter(some, size=(window, 1), mode="nearest")
+    rows = np.arange(len(apart))
+    usual: FloatArray = np.stack([np.interp(rows, rows[::step], column) for column in median.T], axis=1)
+    return usual
