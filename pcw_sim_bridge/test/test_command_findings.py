@@ -12,6 +12,7 @@ from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulat
 from pcw_sim_bridge.mismatch.command_findings import command_findings, with_rivals
 from pcw_sim_bridge.mismatch.command_tracking import command_problems
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
 # Its joint states come at 300 Hz, so that commands are held over 3, 3 and 4 ms in turn.
@@ -163,3 +164,11 @@ def test_stamps_that_tremble_are_no_dead_time(later):
     commands = dataclasses.replace(commands, stamp=tremble(commands.stamp))
     recording = dataclasses.replace(recording, joint_states=joints, joint_commands=commands)
     assert command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None).named == ()
+
+
+@pytest.mark.parametrize(("controller", "told"), [("computed_torque", False), ("velocity_loops", True)])
+def test_where_speeds_are_commanded_the_report_says_what_nobody_sees(controller, told):
+    """A dead time of four drives that hold speeds was "nothing is missing", and no word that it could not have been seen."""
+    recording = simulate(World(ROBOT, ROBOT, "reduced", controller), Run("run", "identification", 12.0, 3), ())
+    absent = dict(RobotSubject(ROBOT).absent([SimpleNamespace(recording=recording)]))
+    assert ("effort in joint_commands" in absent) == told

@@ -172,6 +172,7 @@ class RobotSubject:
             (sensor, cost)
             for sensor, there, cost in (
                 ("effort in joint_states", _has_effort, cannot),
+                ("effort in joint_commands", _has_torque_commands, "a dead time, a lag and a limit of the motors cannot be seen"),
                 ("imu/data", _has_imu, "slip of all wheels together, and faults of the sensor itself, cannot be seen"),
                 ("ground_truth/odom", _has_truth, "the path is the robot's own; what all wheels do wrong alike is not seen"),
             )
@@ -220,6 +221,12 @@ def _contradiction(robot: RobotDescription, recording: Recording) -> float:
 
 def _has_effort(recording: Recording) -> bool:
     return bool(np.isfinite(recording.joint_states.effort).any())
+
+
+def _has_torque_commands(recording: Recording) -> bool:
+    """Whether most commands are torques; drives that hold speeds are commanded none while they are off, too."""
+    commands = recording.joint_commands
+    return commands is not None and commands.effort is not None and bool(np.isfinite(commands.effort).mean() > 0.5)
 
 
 def _has_imu(recording: Recording) -> bool:
