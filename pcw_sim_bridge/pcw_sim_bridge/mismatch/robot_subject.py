@@ -172,7 +172,7 @@ class RobotSubject:
             (sensor, cost)
             for sensor, there, cost in (
                 ("effort in joint_states", _has_effort, cannot),
-                ("effort in joint_commands", _has_torque_commands, "a dead time, a lag and a limit of the motors cannot be seen"),
+                ("effort in joint_commands", _has_torque_commands, "dead times, lags and limits of the motors cannot be seen"),
                 ("imu/data", _has_imu, "slip of all wheels together, and faults of the sensor itself, cannot be seen"),
                 ("ground_truth/odom", _has_truth, "the path is the robot's own; what all wheels do wrong alike is not seen"),
             )
