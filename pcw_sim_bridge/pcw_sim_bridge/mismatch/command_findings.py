@@ -10,29 +10,27 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from scipy import interpolate, special, stats
+from scipy import stats
 
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.robot_description import AXIS_NAMES
 
-from .command_tracking import PRESENCE
+from .common_effect import in_common
 from .evidence_selection import EffectSearch
-from .explanation import AMBIGUOUS, HALF_WIDTH, Estimate, Explanation, NamedTerm, explain, explanation_by
+from .explanation import AMBIGUOUS, HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
 from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
 from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
-from .regression_problem import UNKNOWN, FloatArray, RegressionProblem, Term
+from .regression_problem import UNKNOWN, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
-from .shape_search import DROP
-from .whitened_regression import Instance, WhitenedRegression
+from .whitened_regression import Instance
 
 Progress = Callable[[str], None]
 # A part of the noise that what most joints of an axis have must move another at least.
 SHARE_OF_COMMON = 0.1
 # Numbers of several joints agree where chance alone would part them further once in so many.
 AGREEING = 0.999
-FINE = 400  # numbers of a common effect, between those that are tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,9 +108,8 @@ def _explanations(
     a smaller part of the noise than where nothing is known; and what none of them says clearly enough, all together may.
     """
     looks = [_first_look(problem, settings) for problem in problems]
-    plain, small = settings or SelectionSettings(), dataclasses.replace(
-        settings or SelectionSettings(), smallest_share=SHARE_OF_COMMON
-    )
+    plain = settings or SelectionSettings()
+    small = dataclasses.replace(plain, smallest_share=SHARE_OF_COMMON)
 
     def said(k: int, own: SelectionSettings) -> Explanation | None:
         idle = max(looks[k].values(), default=0.0) < own.lenient_gain
@@ -141,110 +138,6 @@ def _say_together(looks: Sequence[Mapping[str, float]]) -> float:
     """What the first looks at all joints of an axis say at most for one effect [nats]."""
     effects = set().union(*looks)
     return max((sum(max(look.get(e, -math.inf), -AMBIGUOUS) for look in looks) for e in effects), default=0.0)
-
-
-def in_common(explanations: Sequence[Explanation], threshold: float) -> list[Explanation]:
-    """What joints say together where none says enough alone: with the one effect that all have, with the same number.
-
-    Args:
-        explanations: one per joint, without effects.
-        threshold: evidence [nats] that all have to give together.
-
-    Returns:
-        Explanations with the effect, its number and its probability as all have it; empty where there is none.
-    """
-    effects = sorted({t.effect for e in explanations for t in e.search.problem.terms if len(t.resolution) == 1})
-    first = [_profile(explanations, effect, [e.selection.regression for e in explanations]) for effect in effects]
-    if not first:
-        return []
-    # Under the noise of the set with it: under that of the set without, whatever changes slowly is noise.
-    sets = [[_instance(e, profile.effect, profile.shape) for e in explanations] for profile in first]
-    quietest = min(sets, key=lambda instances: sum(
-        math.log(_size(e.search.residual_of([own]))) for e, own in zip(explanations, instances, strict=True)
-    ))  # fmt: skip
-    regressions = [e.search.whiten_beside([own]) for e, own in zip(explanations, quietest, strict=True)]
-    profiles = {effect: _profile(explanations, effect, regressions) for effect in effects}
-    best = max(profiles, key=lambda effect: profiles[effect].evidence)
-    if profiles[best].evidence < threshold:
-        return []
-    profile = profiles[best]
-    rivals = {effect: other.evidence - profile.evidence for effect, other in profiles.items() if effect != best}
-    probability = 1.0 / (1.0 + math.exp(-profile.evidence) + sum(math.exp(odds) for odds in rivals.values()))
-    alike = tuple(effect for effect, odds in rivals.items() if odds > -AMBIGUOUS)
-    found = []
-    for explanation in explanations:
-        own = explanation_by(explanation, [_instance(explanation, best, profile.shape)], known=True)
-        named = tuple(
-            dataclasses.replace(
-                entry, probability=probability, ambiguous_with=alike,
-                estimates=entry.estimates | {profile.name: dataclasses.replace(
-                    entry.estimates[profile.name], value=profile.value, low=profile.low, high=profile.high
-                )},
-            )
-            for entry in own.named
-        )  # fmt: skip
-        found.append(dataclasses.replace(own, named=named))
-    return found if sum(bool(explanation.named) for explanation in found) > 1 else []
-
-
-@dataclasses.dataclass(frozen=True)
-class _Profile:
-    """Evidence of several joints for one number of an effect.
-
-    Attributes:
-        shape: of the effect with the best number; name: of that.
-        low, high: where the evidence has fallen as at the ends of 95 %.
-        evidence: against nothing, the mean over all numbers on a logarithmic scale [nats].
-    """
-
-    effect: str
-    name: str
-    shape: dict[str, float]
-    low: float
-    high: float
-    evidence: float
-
-    @property
-    def value(self) -> float:
-        return self.shape[self.name]
-
-
-def _term_of(explanation: Explanation, effect: str) -> tuple[int, Term]:
-    return next((k, term) for k, term in enumerate(explanation.search.problem.terms) if term.effect == effect)
-
-
-def _instance(explanation: Explanation, effect: str, shape: Mapping[str, float]) -> Instance:
-    index, term = _term_of(explanation, effect)
-    return Instance(index, tuple(sorted(shape.items())), term.base_indices())
-
-
-def _profile(explanations: Sequence[Explanation], effect: str, regressions: Sequence[WhitenedRegression]) -> _Profile:
-    """Evidence of all joints for an effect with the same number in each, by that number: where it is tried, and between."""
-    term = _term_of(explanations[0], effect)[1]
-    [name] = term.resolution
-    rest = {key: value for key, value in term.shapes[0].items() if key != name}
-    tried = sorted({
-        shape[name] for e in explanations for shape in _term_of(e, effect)[1].shapes
-        if all(shape[key] == value for key, value in rest.items())
-    })  # fmt: skip
-    total = np.full(len(tried), term.log_prior)
-    for explanation, regression in zip(explanations, regressions, strict=True):
-        instances = [_instance(explanation, effect, rest | {name: value}) for value in tried]
-        total += [_evidence_as_it_is(regression, instance) for instance in instances]
-    fine = np.linspace(math.log(tried[0]), math.log(tried[-1]), FINE)
-    heights = interpolate.PchipInterpolator(np.log(tried), total)(fine)
-    near = np.exp(fine[heights > heights.max() - DROP])
-    shape = rest | {name: math.exp(float(fine[np.argmax(heights)]))}
-    evidence = float(special.logsumexp(heights)) - math.log(FINE)
-    return _Profile(effect, name, shape, float(near[0]), float(near[-1]), evidence)
-
-
-def _evidence_as_it_is(regression: WhitenedRegression, instance: Instance) -> float:
-    """Evidence for an effect with its presence at one, against nothing [nats]: by the ratio of Savage and Dickey."""
-    fit = regression.fit((instance,))
-    after = stats.norm(fit.mean[-1], math.sqrt(fit.covariance[-1, -1])).logpdf(1.0)
-    before = stats.norm(0.0, PRESENCE.deviation).logpdf(1.0)
-    return float(fit.log_evidence - regression.fit(()).log_evidence + after - before)
 
 
 def with_rivals(explanation: Explanation) -> Explanation:
