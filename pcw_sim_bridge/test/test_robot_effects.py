@@ -8,13 +8,14 @@ import pytest
 
 from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
-from pcw_description.effects.registry import read_physics
+from pcw_description.effects.kinds import JointTorqueEffect
+from pcw_description.effects.registry import get, read_physics
 from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_effects import _flank, _lagging
+from pcw_sim_bridge.mismatch.robot_effects import _flank, _lagging, torque_along
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST
 from pcw_sim_bridge.simulated_run import record_run
@@ -168,6 +169,23 @@ def test_more_friction_is_no_more_scrub(tmp_path: Path) -> None:
     print(f"{estimate.value:.5g} ({estimate.low:.5g} to {estimate.high:.5g})")
     assert estimate.low < radius < estimate.high
     assert estimate.value == pytest.approx(radius, rel=0.05)
+
+
+@pytest.mark.parametrize(("ripple_rate", "left"), [(0.02, 1.0), (0.1, 1.0), (0.97, 0.0), (1.03, 0.0), (2.1, 0.0)])
+def test_ripples_faster_than_a_motions_samples_are_none_that_are_slow(ripple_rate: float, left: float) -> None:
+    """Thirty ripples a turn, at one turn a second, were sampled 31 times a second: held-out data refused them."""
+    effect = get("motor_cogging")
+    assert isinstance(effect, JointTorqueEffect)
+    position = 2.0 * np.pi * ripple_rate / 30.0 * np.arange(400.0)
+    still = np.zeros_like(position)
+
+    def torque(*signals: np.ndarray) -> np.ndarray:
+        return effect.contribution(*signals, {"cosine": 1.0, "sine": 0.0, "order": 30.0})[:, None]
+
+    found = torque_along(effect, (position, still, still, still), torque)[20:-20, 0]
+    assert len(found) == 360
+    wanted = left * np.cos(30.0 * position[20:-20])
+    np.testing.assert_allclose(found, wanted, atol=0.01)
 
 
 def test_play_lies_where_it_lay_while_next_to_no_torque_passes():

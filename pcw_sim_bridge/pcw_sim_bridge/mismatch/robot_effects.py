@@ -8,7 +8,7 @@ effect's column; nothing is derived by hand. What acts between a command and the
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from scipy import signal
@@ -53,6 +53,7 @@ from pcw_description.effects.kinds import (
 from pcw_description.effects.registry import get
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER, RobotDescription
 
+from .axis_channels import kernel_arguments
 from .regression_problem import FloatArray
 from .robot_motion import RobotMotion
 from .rolling_model import (
@@ -75,6 +76,9 @@ PLAY_TORQUE = 0.1
 LOAD_ROUNDS, LEAST_LIFT = 6, 1e-6
 # What begins between two samples of a motion is seen so many times between them.
 BETWEEN_SAMPLES = 12
+# A torque by the angle may change faster than a motion is sampled: 30 ripples a turn, at one turn a second, are 30 Hz. It is
+# computed between samples and low-passed by so many taps: flat to a sixth of their rate, none left beyond six tenths of it.
+RIPPLE_TAPS, RIPPLE_CUTOFF = 96, 0.38
 
 
 def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
@@ -265,6 +269,29 @@ def _between_samples(rows: FloatArray) -> FloatArray:
     return (1.0 - part) * rows[first] + part * rows[np.minimum(first + 1, len(rows) - 1)]
 
 
+def torque_along(
+    effect: JointTorqueEffect, signals: Sequence[FloatArray], torque: Callable[..., FloatArray]
+) -> FloatArray:
+    """Return what a function makes of a joint's position, velocity, torque and load along a motion, as its samples hold it.
+
+    Args:
+        effect: which of the signals the function depends on.
+        signals: position, velocity, motor torque and normal force (T,) each.
+        torque: function of these, (N,) each, for any N; result (N, K).
+
+    Returns:
+        (T, K) [N m].
+    """
+    if "position" not in kernel_arguments(effect.name):
+        return torque(*signals)
+    fine = torque(*_between_samples(np.stack(signals, axis=1)).T)
+    taps = signal.firwin(RIPPLE_TAPS, RIPPLE_CUTOFF, fs=BETWEEN_SAMPLES)
+    # The middle of an even number of taps lies between two values, as a sample lies between those about it.
+    first = (RIPPLE_TAPS + BETWEEN_SAMPLES) // 2 - 1
+    passed: FloatArray = signal.oaconvolve(fine, taps[:, None], mode="full", axes=0)
+    return passed[first::BETWEEN_SAMPLES][: len(signals[0])]
+
+
 @dataclasses.dataclass(frozen=True)
 class ChannelModel:
     """The channels of one robot as it is described, the effects of its `physics` at work.
@@ -303,7 +330,11 @@ class ChannelModel:
                 position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.balanced_torque))
                 if axis == STEER:  # of the heading, whatever is read of it
                     position = self.numbers.headings(motion.position)[:, i]
-                torque[:, i, axis] += effect.contribution(position, velocity, force, normal[:, i], instance.parameters)
+                found = torque_along(
+                    effect, (position, velocity, force, normal[:, i]),
+                    lambda *at, effect=effect: effect.contribution(*at, instance.parameters)[:, None],
+                )  # fmt: skip
+                torque[:, i, axis] += found[:, 0]
             return dataclasses.replace(around, torque=torque)
         under, height, normal = self._under_wheels(motion, around, instance, normal)
         radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()

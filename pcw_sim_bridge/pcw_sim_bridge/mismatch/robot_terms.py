@@ -35,6 +35,7 @@ from .channel_differences import ChannelDifferences
 from .composed_columns import Columns, Placed, Turning, frozen
 from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
+from .robot_effects import torque_along
 
 DIRECTIONS = 8  # of a grid over all directions
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
@@ -134,13 +135,17 @@ class _TermMaker:
         column = AXIS_NAMES.index(axis or effect.axis)
         casters = [self.robot.caster_index(name) for name in target]
         torques = []
+
+        def parts(position: FloatArray, velocity: FloatArray, force: FloatArray, load: FloatArray) -> FloatArray:
+            by_name = effect.regressor(position, velocity, force, load, shape)
+            return np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1)
+
         for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
             found = np.zeros((*motion.position.shape, len(effect.linear_parameters)))
             for i in casters:
                 signals = motion.position, motion.velocity, motion.balanced_torque
                 position, velocity, force = (s[:, i, column] for s in signals)
-                by_name = effect.regressor(position, velocity, force, normal[:, i], shape)
-                found[:, i, column] = np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1)
+                found[:, i, column] = torque_along(effect, (position, velocity, force, normal[:, i]), parts)
             torques.append(found)
         return self.differences.of_torque(torques)
 
