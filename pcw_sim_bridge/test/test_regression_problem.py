@@ -750,10 +750,14 @@ def test_an_effect_takes_over_what_the_same_number_has_of_it():
 
 @pytest.mark.parametrize(
     ("argument", "powers", "shared"),
-    [("velocity", (1, 3), True), ("velocity", (3,), False), ("angle", (1, 3), False)],
+    [("velocity", (1, 3), True), ("velocity", (3,), True), ("velocity", (2,), False), ("angle", (1, 3), False)],
 )
 def test_a_name_that_a_law_of_the_same_argument_can_hold_is_believed_by_half(argument, powers, shared):
-    """Which part of a curve of the speed is viscous friction nothing tells; a cube is none, nor what varies with an angle."""
+    """Which part of a curve of the speed is viscous friction nothing tells; a square is none, nor what varies with an angle.
+
+    A drag by the square of the speed, with its sign, was a viscous friction, for sure, and a law by the cube beside it: that
+    can hold nine tenths of what such a friction does.
+    """
     rng = np.random.default_rng(2)
     velocity = 2.0 * np.sin(np.arange(20 * SAMPLES) / RATE)
     problem = one_channel(

@@ -49,7 +49,7 @@ MOST_PROMISING, PROMISING_SAMPLES = 4, 500
 # A closed form may leave this part more of what a curve explains; and this, if it does without a name that the curve needs.
 CLOSED_PART, SIMPLER_PART = 0.01, 0.05
 # What is left of the probability of a name that a curve of the same argument can hold to this part of its square.
-SHARED_BELIEF, HELD_PART = 0.5, 0.95
+SHARED_BELIEF, HELD_PART = 0.5, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
