@@ -303,9 +303,12 @@ def test_answers_that_are_not_those_sealed_are_refused(tmp_path: Path) -> None:
 
 
 def test_baselines_on_the_same_cases() -> None:
-    said = {"name": "other", "named": ["drive_coulomb_friction", "x"], "inverse_nrmse": [0.4, 0.2], "seconds": 2.0}
+    """A method names targets, too, and a remark is no error: one seemed never to have run, and none to be right."""
+    said = {"name": "other", "named": ["drive_coulomb_friction/rear_left", "x"], "inverse_nrmse": [0.4, 0.2], "seconds": 2.0,
+            "remark": "48 numbers"}
     own = dataclasses.replace(judged(SINGLE, report()), baselines=[said])
-    healthy = dataclasses.replace(judged(answer("none"), report()), baselines=[said, {"name": "third", "error": "no data"}])
+    failed = {"name": "third", "named": [], "inverse_nrmse": None, "seconds": 0.1, "remark": "no data"}
+    healthy = dataclasses.replace(judged(answer("none"), report()), baselines=[said, failed])
     from pcw_sim_bridge.mismatch.challenge.score import tables
 
     [table] = [t for t in tables([own, healthy]) if t.title.startswith("Baselines")]

@@ -104,7 +104,7 @@ def _run_baselines(case: Path, out: Path) -> None:
     fit, holdout = recordings_of(case)
     begun = time.monotonic()
     results = _baseline_function()(load_robot(case / "robot.yaml"), fit, holdout, _noise_floors(out))
-    found = [{**dataclasses.asdict(r), "named": list(r.names), "error": r.remark} for r in results]
+    found = [{**dataclasses.asdict(r), "named": list(r.names)} for r in results]
     part = out / f"{BASELINES}.part"
     part.write_text(json.dumps({"baselines": found, "seconds": time.monotonic() - begun}, indent=1), encoding="utf-8")
     os.replace(part, out / BASELINES)

@@ -380,20 +380,20 @@ def _parameters(judged: Sequence[Judgement]) -> Table:
 
 
 def _baselines(judged: Sequence[Judgement]) -> Table:
-    """Other people's methods: `name`, `named` (list), `inverse_nrmse` [before, after], `seconds`, `error` of each."""
+    """Other people's methods: `name`, `named` (list), `inverse_nrmse` [before, after] if it ran, `seconds` of each."""
     by_name: dict[str, list[tuple[Judgement, Mapping[str, Any]]]] = {}
     for j in judged:
         for entry in j.baselines:
             by_name.setdefault(str(entry["name"]), []).append((j, entry))
     rows = []
     for name, entries in sorted(by_name.items()):
-        ran = [(j, e) for j, e in entries if not e.get("error")]
+        ran = [(j, e) for j, e in entries if e.get("inverse_nrmse")]
         healthy = [e for j, e in ran if j.kind == "none"]
-        ratios = [e["inverse_nrmse"][1] / e["inverse_nrmse"][0] for _, e in ran if e.get("inverse_nrmse")]
+        ratios = [e["inverse_nrmse"][1] / e["inverse_nrmse"][0] for _, e in ran]
         times = [e["seconds"] for _, e in ran if "seconds" in e]
         rows.append((
             name, f"{len(ran)} of {len(entries)}",
-            _ratio(sum({k[0] for k in j.truth} <= set(e.get("named", ())) for j, e in ran if j.truth),
+            _ratio(sum({k[0] for k in j.truth} <= {n.partition("/")[0] for n in e["named"]} for j, e in ran if j.truth),
                    sum(bool(j.truth) for j, _ in ran)),
             _ratio(sum(bool(e.get("named")) for e in healthy), len(healthy)),
             f"{np.median(ratios):.2f}" if ratios else "", f"{np.median(times):.1f} s" if times else "",
