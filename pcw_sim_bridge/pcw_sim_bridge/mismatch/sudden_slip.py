@@ -1,4 +1,4 @@
-"""Moments at which wheels and tracker part suddenly: where no other wheel says that one slips, or that a counter jumped.
+"""Moments at which wheels and tracker part suddenly: where no wheel says that another one slips, or all slip together.
 
 A wrong number of the description parts them slowly, as the robot turns and changes its speed. What comes within a moment
 and is gone again is no number: a wheel spun, a counter lost its place, the tracker saw something else.
@@ -12,7 +12,7 @@ from scipy import ndimage
 from .regression_problem import BoolArray, FloatArray
 
 USUAL_DURATION = 3.0  # [s]; what stays for half of it is the usual difference
-MEDIAN_RATE = 25.0  # [Hz] at most
+MEDIAN_RATE = 25.0  # [Hz]; of faster samples about so many are enough for a median of seconds
 SUDDEN = 6.0  # times what the difference usually departs from that, as the standard deviation of its quiet part
 MEDIAN_OF_NORMAL = 0.6745  # of the absolute value of a standard normal number
 
