@@ -58,6 +58,8 @@ LEAST_DURATION = 5.0  # [s]
 # tolerance, or where its standard error is below this part of its tolerance: then the recordings have measured it.
 RETUNED_SIGNIFICANCE = 2.0
 DETERMINED_PART = 0.3
+# More different effects than this at once are hardly what one robot has: who has its description mixed up gets them, too.
+MOST_AT_ONCE = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +133,8 @@ def analyse(
     proof = prover.prove(explanation, bool(commands.named))
     explanation = proof.explanation
     problem = explanation.search.problem
-    everything = [*((named, _instance(named)) for named in explanation.named), *commands.named]
+    pairs = [*((named, _instance(named)) for named in explanation.named), *commands.named]
+    everything, crowded = doubted_in_a_crowd(pairs)
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
     numbers = {name: value for name, value in _reported_numbers(explanation).items() if name not in proof.untuned}
@@ -164,12 +167,26 @@ def analyse(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
             *(_traces(prover.other, proof.predicted, explanation.fit, "holdout") if prover.other is not None else ()),
         ),
-        notes=(*_notes(explanation, retuned, prover.other is not None, proof, fit), *commands.notes),
+        notes=(*crowded, *_notes(explanation, retuned, prover.other is not None, proof, fit), *commands.notes),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),
     )
     return Analysis(findings, patched, _with_laws(subject, instances, numbers, unknown))
+
+
+def doubted_in_a_crowd(
+    named: Sequence[tuple[NamedTerm, EffectInstance]]
+) -> tuple[Sequence[tuple[NamedTerm, EffectInstance]], tuple[str, ...]]:
+    """Return the effects, half as sure if they are of more kinds than a robot is likely to have, and what to know of that."""
+    kinds = len({entry.term.effect for entry, _ in named})
+    if kinds <= MOST_AT_ONCE:
+        return named, ()
+    doubted = [(dataclasses.replace(entry, probability=0.5 * entry.probability), instance) for entry, instance in named]
+    return doubted, (
+        f"{kinds} different effects at once are more than one robot is likely to have: is this its description? All names are "
+        "half as sure.",
+    )
 
 
 def _with_laws(

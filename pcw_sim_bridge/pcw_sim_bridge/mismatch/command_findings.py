@@ -29,6 +29,8 @@ from .whitened_regression import Instance
 Progress = Callable[[str], None]
 # A part of the noise that what most joints of an axis have must move another at least.
 SHARE_OF_COMMON = 0.1
+# A first look at every so many of the numbers that are tried: what lies between two of them looks nearly like either.
+FIRST_LOOK_STEP = 2
 # Numbers of several joints agree where chance alone would part them further once in so many.
 AGREEING = 0.999
 
@@ -232,6 +234,8 @@ def _pooled(named: Sequence[NamedTerm]) -> NamedTerm | None:
 
 def _first_look(problem: RegressionProblem, settings: SelectionSettings | None) -> dict[str, float]:
     """What every candidate gains over noise as it is, by its effect [nats]."""
+    thinned = (dataclasses.replace(term, shapes=term.shapes[::FIRST_LOOK_STEP]) for term in problem.terms)
+    problem = dataclasses.replace(problem, terms=tuple(thinned))
     search = EffectSearch(problem, np.random.default_rng(0), settings)
     # As white noise: a large effect would pass for slow noise here.
     candidates = search.whiten_at(problem.residual, white=True, by_channel=True).scan(())[0]

@@ -187,11 +187,11 @@ def explain(
         if not finished.vetoed and not {left.variable for left in finished.leftovers} & set(arguments):
             progress(f"refined: {search.label(refined.instances[refined.position])}, {refined.gain:.1f} nats")
             remarks = _remarks(search, selection, refined)
-            selection, doubts = better, refined.doubts(problem)
+            selection, result, doubts = better, finished, refined.doubts(problem)
         else:
             suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
             progress(f"not adopted: {suspect.describe()}")
-    judgement = judge(search, selection)
+    judgement = judge(search, selection, result)
     search, result = judgement.search, judgement.result
     selection = search.balanced(_taking_over(search, judgement.selection))
     problem = search.problem

@@ -111,12 +111,17 @@ class Judgement:
     beliefs: Mapping[int, float]
 
 
-def judge(search: EffectSearch, selection: Selection) -> Judgement:
-    """Look for laws outside the library and for dependences of channels; withdraw the names that they make redundant."""
+def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Judgement:
+    """Look for laws outside the library and for dependences of channels; withdraw the names that they make redundant.
+
+    Args:
+        search, selection: a finished search.
+        left: what the test of its selection leaves.
+    """
     withdrawn: list[tuple[str, str]] = []
     found: list[tuple[Law, FoundLaw]] = []
     beliefs: dict[int, float] = {}
-    result = None
+    result: OpenSetResult | None = left
     for _ in range(LARGEST_LAWS if search.problem.sites is not None else 0):
         law = LawSearch(search, selection).run()
         if law is None:
@@ -126,7 +131,7 @@ def judge(search: EffectSearch, selection: Selection) -> Judgement:
             break
         listed = _in_library(search, selection, law)
         if listed is not None:
-            selection = listed
+            selection, result = listed, None
             continue
         before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
         search, selection, final = _adopted(search, selection, law)

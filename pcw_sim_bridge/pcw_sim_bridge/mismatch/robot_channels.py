@@ -315,11 +315,14 @@ class RobotProblemBuilder:
         borders = np.cumsum([len(motion.time) for motion in self.motions])[:-1]
 
         def columns(forces: FloatArray) -> FloatArray:
-            wrench = np.zeros((len(forces), len(self.channels()), forces.shape[2]))
-            wrench[:, : len(WRENCH)] = -forces[:, 2 * n :]
-            found = differences.filtered(np.split(wrench, borders))
-            torques = forces[:, : 2 * n].reshape(len(forces), n, 2, -1)
-            return found + differences.of_torque(np.split(torques, borders)) if torques.any() else found
+            torques, chassis = forces[:, : 2 * n].reshape(len(forces), n, 2, -1), forces[:, 2 * n :]
+            found = differences.of_torque(np.split(torques, borders)) if torques.any() else None
+            if found is None or chassis.any():
+                wrench = np.zeros((len(forces), len(self.channels()), forces.shape[2]))
+                wrench[:, : len(WRENCH)] = -chassis
+                pushed = differences.filtered(np.split(wrench, borders))
+                found = pushed if found is None else found + pushed
+            return found
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
         return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)

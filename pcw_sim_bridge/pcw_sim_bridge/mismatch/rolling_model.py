@@ -723,7 +723,8 @@ def rolling_state(
         # of tyres, would be found as small, or as large, as makes that noise least.
         added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
         added += (numbers.gain - 1.0) * motion.balanced_torque + numbers.torque_lag * motion.torque_rate
-        added += np.sum(numbers.unreported * motion.loops, axis=3)
+        if numbers.unreported.any():
+            added += np.sum(numbers.unreported * motion.loops, axis=3)
         if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
             added[:, :, DRIVE] += radius * around.climb[:, :, 0]
         load, force = (

@@ -67,17 +67,25 @@ class TorqueResponse:
 
     def apply(self, torque: FloatArray) -> FloatArray:
         """Return what torques (T, n, 2, K) [N m] change in measured minus predicted channels (T, C, K)."""
-        count, n, _, width = torque.shape
+        count, _, _, width = torque.shape
         layout = self.layout
-        torque = np.ascontiguousarray(torque)
-        ratio = _products(self._ratio_of_torque.reshape(-1, 2, 2), torque.reshape(-1, 2, width)).reshape(torque.shape)
+        # Most torques are those of one joint: what does nothing at the other casters need not be computed there.
+        casters = np.flatnonzero(torque.any(axis=(0, 2, 3)))
+        if not len(casters):
+            return np.zeros((count, layout.tracked.stop, width))
+        columns = (2 * casters[:, None] + [0, 1]).ravel()
+        torque = np.ascontiguousarray(torque[:, casters])
+        ratio_of_torque = self._ratio_of_torque[:, casters].reshape(-1, 2, 2)
+        ratio = _products(ratio_of_torque, torque.reshape(-1, 2, width)).reshape(torque.shape)
         ratio -= DAMPING_TIME * derivative(ratio, self._rate)
-        slip = self._speed * ratio + self._length[:, None, None] * derivative(ratio, self._rate)
-        rigid = _products(self._rigid, slip.reshape(count, 2 * n, width))
+        slip = self._speed[:, casters] * ratio + self._length[casters, None, None] * derivative(ratio, self._rate)
+        rigid = _products(np.ascontiguousarray(self._rigid[:, :, columns]), slip.reshape(count, len(columns), width))
         twist, contradiction = -rigid[:, :3], rigid[:, 3:]
         twist_dot = derivative(twist, self._rate)
         found = np.empty((count, layout.tracked.stop, width))
-        found[:, :3] = _products(self._wrench_of_torque, torque.reshape(count, 2 * n, width))
+        found[:, :3] = _products(
+            np.ascontiguousarray(self._wrench_of_torque[:, :, columns]), torque.reshape(count, len(columns), width)
+        )
         found[:, :3] -= _products(self._inertia, twist_dot) + _products(self._turning, twist)
         found[:, layout.consistency] = -contradiction
         if layout.imu:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import sys
 import time
 from collections.abc import Sequence
@@ -60,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
     from ..report import check_output, write_report
 
     one_thread()  # the analysis has its own, see `all_cores`: those of linear algebra would take turns with them, and spin
+    gc.freeze()  # what has been imported stays; to look through all of it for garbage at the end takes half a second
     topics = remapped_topics(options.topic)
     for path in (*options.recordings, *options.holdout):
         if not path.exists():

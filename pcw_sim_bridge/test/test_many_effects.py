@@ -1,0 +1,34 @@
+"""A robot that seems to have everything at once has another description, more likely than not."""
+
+import numpy as np
+import pytest
+
+from pcw_description.effect_instance import EffectInstance
+from pcw_sim_bridge.mismatch.analysis import MOST_AT_ONCE, doubted_in_a_crowd
+from pcw_sim_bridge.mismatch.explanation import NamedTerm
+from pcw_sim_bridge.mismatch.regression_problem import Term
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
+
+KINDS = ("payload_mass", "payload_offset", "wheel_radius_error", "caster_offset_error", "torque_constant_error")
+
+
+def named(effect: str, caster: str) -> tuple[NamedTerm, EffectInstance]:
+    """Return an effect as it is named with a probability of 0.9."""
+    term = Term(effect=effect, target=(caster,), parameters=(), shapes=({},), columns=lambda shape: np.zeros((1, 1, 0)))
+    entry = NamedTerm(Instance(0, (), ()), term, {}, 0.9, (), 20.0, 20.0, np.zeros((1, 1)))
+    return entry, EffectInstance(effect, (caster,), {}, None)
+
+
+def test_so_many_kinds_of_effects_at_once_are_half_as_sure_and_the_description_is_asked_about() -> None:
+    """Another robot of nearly the same geometry passes all checks of its recordings, and differs in everything else."""
+    doubted, notes = doubted_in_a_crowd([named(kind, "left") for kind in KINDS])
+    assert [entry.probability for entry, _ in doubted] == pytest.approx([0.45] * len(KINDS))
+    assert len(notes) == 1 and f"{len(KINDS)} different effects" in notes[0] and "description" in notes[0]
+
+
+def test_many_of_the_same_kinds_are_no_crowd() -> None:
+    """Four orders of a cogging, or a friction in every wheel, are what one robot may well have."""
+    entries = [named(kind, caster) for kind in KINDS[:MOST_AT_ONCE] for caster in ("left", "right", "rear")]
+    kept, notes = doubted_in_a_crowd(entries)
+    assert [entry.probability for entry, _ in kept] == [0.9] * len(entries)
+    assert notes == ()
