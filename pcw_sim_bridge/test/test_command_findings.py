@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
@@ -103,6 +104,20 @@ def test_drives_that_hardly_reached_the_limit_of_the_others_have_it_unless_they_
     for named, _ in findings.named:
         assert named.estimates["torque"].value == pytest.approx(limit["torque"], rel=0.01)
     assert len(findings.notes) == (1 if len(limited) == ROBOT.n else 0)
+
+
+def test_a_limit_that_one_drive_seldom_reaches_is_its_own():
+    """It moves less than a quarter of the noise, and was called a detail of that drive; so all four together were given it."""
+    run = Run("run", "identification", 30.0, 1)
+    healthy = simulate(World(ROBOT, ROBOT, "reduced"), run, ())
+    asked, noise = np.abs(healthy.joint_commands.effort[:, 1, 0]), ROBOT.sensors.encoders.torque_noise
+    beyond = optimize.brentq(lambda t: np.sqrt(np.mean(np.maximum(asked - t, 0.0) ** 2)) - 0.18 * noise, 0.0, asked.max())
+    limit = EffectInstance("torque_saturation", ROBOT.caster_names[1:2], LIMIT | {"torque": float(beyond)}, "drive")
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), run, [limit])
+    findings = command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None)
+    [(named, instance)] = findings.named
+    assert (instance.name, instance.target) == ("torque_saturation", limit.target)
+    assert named.estimates["torque"].low < beyond < named.estimates["torque"].high
 
 
 def test_one_joint_at_fault_is_named_alone():

@@ -129,6 +129,13 @@ def uneven_gain(state: PlantState, motor: np.ndarray) -> np.ndarray:
     return torque
 
 
+def weak_one_way(state: PlantState, motor: np.ndarray) -> np.ndarray:
+    """A motor that gives little of its torque one way, and more than all of it the other."""
+    torque = np.zeros((4, 2))
+    torque[0, 0] = -0.6 * abs(motor[0, 0])
+    return torque
+
+
 def record(path: Path, law: ExtraTorque | None, seed: int, monkeypatch: pytest.MonkeyPatch, excitation: str = "identification",
            duration: float = 25.0) -> Path:  # fmt: skip
     """A run of the thesis robot with a mass that is off within tolerance."""
@@ -183,6 +190,13 @@ def test_what_changes_with_the_time_is_told_where_it_is_a_small_part_of_what_is_
     assert (findings.verdict, findings.effects) == ("unexplained", ())
     [unknown] = findings.unknown
     assert unknown.depends_on[0] == "time"
+
+
+def test_a_motor_that_is_much_weaker_one_way_is_no_gear_friction(tmp_path, monkeypatch):
+    """So much of its torque no law was allowed to take away: a friction under load was named, surely, and an unknown rest."""
+    findings = analysed(record(tmp_path / "run", weak_one_way, 3, monkeypatch, "random_goals", 40.0)).findings
+    assert (findings.verdict, findings.effects) == ("unexplained", ())
+    assert ("drive_torque/front_left", "drive_torque/front_left") in {(u.channel, u.depends_on[0]) for u in findings.unknown}
 
 
 @pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.nightly), 4])

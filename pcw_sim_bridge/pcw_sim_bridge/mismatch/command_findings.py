@@ -29,6 +29,8 @@ from .whitened_regression import Instance
 Progress = Callable[[str], None]
 # A part of the noise that what most joints of an axis have must move another at least.
 SHARE_OF_COMMON = 0.1
+# So may be what one joint alone says so clearly at first sight [nats]: a limit is at work now and then, and not small then.
+CLEAR = 100.0
 # A first look at every so many of the numbers that are tried: what lies between two of them looks nearly like either.
 FIRST_LOOK_STEP = 2
 # Numbers of several joints agree where chance alone would part them further once in so many.
@@ -107,15 +109,17 @@ def _explanations(
     """What each joint says; None where it says nothing.
 
     All joints of an axis hang on one bus and on drives of one kind. What most of them have is looked for in the others down to
-    a smaller part of the noise than where nothing is known; and what none of them says clearly enough, all together may.
+    a smaller part of the noise than where nothing is known, and so is what one says very clearly; what none of them says
+    clearly enough, all together may.
     """
     looks = [_first_look(problem, settings) for problem in problems]
     plain = settings or SelectionSettings()
     small = dataclasses.replace(plain, smallest_share=SHARE_OF_COMMON)
 
     def said(k: int, own: SelectionSettings) -> Explanation | None:
-        idle = max(looks[k].values(), default=0.0) < own.lenient_gain
-        return None if idle else with_rivals(explain(problems[k], np.random.default_rng(seed), own))
+        most = max(looks[k].values(), default=0.0)
+        own = small if most > CLEAR else own
+        return None if most < own.lenient_gain else with_rivals(explain(problems[k], np.random.default_rng(seed), own))
 
     found = [said(k, plain) for k in range(len(problems))]
     for axis in AXIS_NAMES:

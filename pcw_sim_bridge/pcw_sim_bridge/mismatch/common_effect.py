@@ -20,6 +20,7 @@ from .shape_search import DROP
 from .whitened_regression import Instance, WhitenedRegression
 
 FINE = 400  # numbers at which the evidence is read between those that are tried
+LEAST_OF_OTHERS = 2.0  # evidence [nats] of all joints but the one that says most
 LEAST_SQUARE = 1e-300  # of what an ideal simulation leaves
 
 
@@ -46,6 +47,13 @@ def in_common(explanations: Sequence[Explanation], threshold: float) -> list[Exp
     if profiles[best].evidence < threshold:
         return []
     profile = profiles[best]
+    # What one joint alone says is said of that one.
+    each = [
+        _evidence_as_it_is(regression, _instance(explanation, best, profile.shape))
+        for explanation, regression in zip(explanations, regressions, strict=True)
+    ]
+    if sum(each) - max(each) < LEAST_OF_OTHERS:
+        return []
     rivals = {effect: other.evidence - profile.evidence for effect, other in profiles.items() if effect != best}
     probability = 1.0 / (1.0 + math.exp(-profile.evidence) + sum(math.exp(odds) for odds in rivals.values()))
     alike = tuple(effect for effect, odds in rivals.items() if odds > -AMBIGUOUS)

@@ -146,8 +146,9 @@ class LawSearch:
             if site not in law.sites or motor not in law.depends_on:
                 continue
             torques = law.torques(sites) if torques is None else torques
-            taken = torques[:, index] @ weights
-            if np.sum(taken**2) > LARGEST_MOTOR_PART**2 * np.sum(sites.variables[motor] ** 2):
+            # In proportion: what is half of it, against it one way and along with it the other, is a law of its own.
+            given = sites.variables[motor]
+            if abs((torques[:, index] @ weights) @ given) > LARGEST_MOTOR_PART * (given @ given):
                 return True
         return False
 

@@ -169,9 +169,10 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
 
 def _lagging(values: FloatArray, lag: float) -> FloatArray:
     """What follows values (T,) with a time constant of `lag` samples: the twist of a spring that is damped."""
-    denominator = [1.0 + 2.0 * lag, 1.0 - 2.0 * lag]
-    start = signal.lfiltic([1.0, 1.0], denominator, y=values[:1], x=values[:1])
-    followed: FloatArray = signal.lfilter([1.0, 1.0], denominator, values, zi=start)[0]
+    leading = 1.0 + 2.0 * lag  # divided by here: what starts a filter does so itself only since scipy 1.12
+    numerator, denominator = [1.0 / leading, 1.0 / leading], [1.0, (1.0 - 2.0 * lag) / leading]
+    start = signal.lfiltic(numerator, denominator, y=values[:1], x=values[:1])
+    followed: FloatArray = signal.lfilter(numerator, denominator, values, zi=start)[0]
     return followed
 
 

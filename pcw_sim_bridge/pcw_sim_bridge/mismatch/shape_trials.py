@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from .regression_problem import FloatArray
-from .whitened_regression import Instance, WhitenedRegression, marginal_gains
+from .whitened_regression import Instance, WhitenedRegression, forward_substituted, marginal_gains
 
 
 class Trial(NamedTuple):
@@ -32,7 +31,7 @@ class ShapeTrials:
         self.regression = regression
         gram, deviations = regression.gram(others), regression.deviations(others)
         self._factor = np.linalg.cholesky(gram[:-1, :-1] + np.diag(1.0 / deviations**2))
-        self._projected = linalg.solve_triangular(self._factor, gram[:-1, -1:], lower=True)
+        self._projected = forward_substituted(self._factor, gram[:-1, -1:])
         self._design = regression.design(others)
         term = regression.problem.terms[instance.term]
         parameters = [term.parameters[k] for k in instance.active]
@@ -61,5 +60,5 @@ class ShapeTrials:
         """Gram matrices of the columns of each instance, and their products with the set and with the target."""
         pieces = self.regression.tried_columns(instances)
         columns = np.concatenate(pieces, axis=1)
-        cross = linalg.solve_triangular(self._factor, self._design.T @ columns, lower=True)
+        cross = forward_substituted(self._factor, self._design.T @ columns)
         return np.stack([piece.T @ piece for piece in pieces]), cross, columns.T @ self.regression.target[:, None]

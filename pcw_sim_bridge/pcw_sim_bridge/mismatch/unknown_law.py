@@ -235,8 +235,12 @@ def _basis(sites: Sites, places: Sequence[Place], kind: str) -> Basis | None:
         low, high = quantiles[0], quantiles[-1]
         if high - low < 1e-3 * max(abs(low), abs(high), 1e-300):
             return None
-        # Halfway between equal steps and equal numbers of samples.
-        knots.append(tuple((0.5 * (quantiles + np.linspace(low, high, len(parts)))).tolist()))
+        # Halfway between equal steps and equal numbers of samples; one where the sign changes, as many laws bend there.
+        own = 0.5 * (quantiles + np.linspace(low, high, len(parts)))
+        nearest = int(np.argmin(np.abs(own[1:-1]))) + 1
+        if own[nearest - 1] < 0.0 < own[nearest + 1]:
+            own[nearest] = 0.0
+        knots.append(tuple(own.tolist()))
     return Basis(kind, tuple(knots), sites.smoothing if kind == "speed" else 0.0)
 
 

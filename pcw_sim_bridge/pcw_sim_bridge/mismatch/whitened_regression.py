@@ -17,6 +17,7 @@ import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -101,6 +102,14 @@ class _ScanGroup:
     lower: FloatArray
     upper: FloatArray
     log_prior: FloatArray
+
+
+def forward_substituted(factor: npt.NDArray[Any], values: npt.NDArray[Any]) -> FloatArray:
+    """Return the solution (k, N) of a lower triangle (k, k) for values (k, N); k may be 0, which not every LAPACK takes."""
+    if not len(factor):
+        return values
+    solved: FloatArray = linalg.solve_triangular(factor, values, lower=True)
+    return solved
 
 
 def marginal_gains(
@@ -487,7 +496,7 @@ class WhitenedRegression:
         gram = bank.gram(with_target)
         factor = np.linalg.cholesky(gram[:-1, :-1] + np.diag(1.0 / deviations**2))
         own = gram[:-1, -1:] if targets is None else bank.columns(picked).T @ targets
-        projected = linalg.solve_triangular(factor, own, lower=True)
+        projected = forward_substituted(factor, own)
         used = {instance.term for instance in instances}
 
         def wanted(index: int) -> bool:
@@ -501,7 +510,7 @@ class WhitenedRegression:
             columns = group.columns[keep]
             flat = columns.ravel()
             products = bank.products(with_target, flat)
-            cross = linalg.solve_triangular(factor, products[:-1], lower=True)
+            cross = forward_substituted(factor, products[:-1])
             moment = products[-1:].T if targets is None else bank.columns(flat).T @ targets
             gains = _gains_within(
                 group.gram[keep], cross, moment, projected,
@@ -515,9 +524,7 @@ class WhitenedRegression:
             white, gram = self._long_scan(index)
             flat_columns = white.reshape(len(white), -1)
             design = bank.columns(picked)
-            cross = linalg.solve_triangular(
-                factor, (flat_columns.T @ design.astype(np.float32)).astype(float).T, lower=True
-            )
+            cross = forward_substituted(factor, (flat_columns.T @ design.astype(np.float32)).astype(float).T)
             right = self.target[:, None] if targets is None else targets
             moment = (flat_columns.T @ right.astype(np.float32)).astype(float)
             parameters = [term.parameters[i] for i in term.base_indices()]
