@@ -13,7 +13,7 @@ from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.first_look import Looked, orders, patches, waves, windows
+from pcw_sim_bridge.mismatch.first_look import Looked, common_orders, orders, patches, waves, windows
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -192,6 +192,23 @@ def test_a_problem_is_exact_where_it_is_made_so(tmp_path: Path) -> None:
             left.append(float(np.std(explained[np.ix_(rows, slip)])))
     healthy, _, first_order, exactly = left
     assert exactly < 1.5 * healthy < first_order
+
+
+@pytest.mark.parametrize(
+    ("last", "wanted"),
+    [([28.48, 29.54, 30.93], [26.0]), ([28.48, 26.01], [26.0]), ([], [26.0])],
+    ids=["louder ones", "among others", "too little of a turn"],
+)
+def test_a_ripple_of_most_joints_is_one_of_all(last: list[float], wanted: list[float]) -> None:
+    """Three drives had 26 a radian; the fourth was given 28.4, 29.5 and two more, and the four were coggings one by one."""
+    found = [np.array(own) for own in ([26.0, 26.4], [25.99, 27.3], [26.02], last) if own]
+    assert common_orders(found, [0.07] * len(found)) == [pytest.approx(order, abs=0.01) for order in wanted]
+
+
+def test_a_ripple_of_half_of_the_joints_is_none_of_all() -> None:
+    found = [np.array(own) for own in ([26.0], [26.0], [31.0], [33.0, 41.0])]
+    assert common_orders(found, [0.07] * 4) == []
+    assert common_orders(found[3:], [0.07]) == [33.0, 41.0]
 
 
 @pytest.mark.parametrize("order", [14.0, 21.0, 40.0])

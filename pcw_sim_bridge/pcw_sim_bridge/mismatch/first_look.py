@@ -137,6 +137,26 @@ def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
     return Chosen(np.array(found), len(tried))
 
 
+def common_orders(each: Sequence[FloatArray], widths: Sequence[float]) -> list[float]:
+    """Return the orders [1/rad] that more than half of some joints have, the mean of theirs, the clearest first.
+
+    In one joint others may be louder: what the rest of the robot does passes for ripples of it.
+
+    Args:
+        each: orders of every joint, the clearest first (K,).
+        widths: how far two of them may differ and be one, by joint.
+    """
+    common: list[float] = []
+    ranked = [float(found[rank]) for rank in range(MOST_ORDERS) for found in each if rank < len(found)]
+    for value in ranked:
+        nearest = [float(found[int(np.argmin(np.abs(found - value)))]) for found in each]
+        near = [order for order, width in zip(nearest, widths, strict=True) if abs(order - value) < width]
+        mean = float(np.mean(near))
+        if 2 * len(near) > len(each) and all(abs(mean - other) > min(widths) for other in common):
+            common.append(mean)
+    return common
+
+
 def windows(looked: Looked, columns: FloatArray) -> ChosenShapes:
     """Return the times (`start`, `duration`) in which something is at work that would else be so all the time.
 

@@ -33,7 +33,7 @@ from .all_cores import on_all_cores
 from .axis_channels import kernel_arguments
 from .channel_differences import ChannelDifferences
 from .composed_columns import Columns, Placed, Turning, frozen
-from .first_look import Chosen, ChosenShapes, Looked, orders, patches, waves, windows
+from .first_look import Chosen, ChosenShapes, Looked, common_orders, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 from .robot_effects import torque_along
 
@@ -171,16 +171,22 @@ class _TermMaker:
         return tuple(shapes), among * max(len(shapes), 1)
 
     def _common_orders(self, casters: Sequence[int], axis: int) -> Chosen:
-        """Orders of the ripples that some joints have in common, those that turned far enough to tell: the mean of theirs."""
+        """Orders of the ripples that most of some joints have; a single one is also asked for what most of all have."""
         each = {i: self._orders(i, axis) for i in casters}
-        able = [i for i in casters if len(each[i].values)]
-        widths = {i: math.tau / float(np.ptp(self.looked.angle[:, i, axis])) for i in able}
-        common = []
-        for value in each[able[0]].values if able else ():
-            nearest = {i: each[i].values[int(np.argmin(np.abs(each[i].values - value)))] for i in able}
-            if all(abs(found - value) < widths[i] for i, found in nearest.items()):
-                common.append(float(np.mean(list(nearest.values()))))
+        common = self._of_most(casters, axis)
+        if len(casters) == 1 and common:
+            own, width = list(common), self._width(casters[0], axis)
+            common += [o for o in self._of_most(range(self.robot.n), axis) if all(abs(o - other) > width for other in own)]
         return Chosen(np.array(common), max(chosen.among for chosen in each.values()))
+
+    def _of_most(self, casters: Sequence[int], axis: int) -> list[float]:
+        """Orders that most of the joints have which turned far enough to tell."""
+        able = [i for i in casters if len(self._orders(i, axis).values)]
+        return common_orders([self._orders(i, axis).values for i in able], [self._width(i, axis) for i in able])
+
+    def _width(self, i: int, axis: int) -> float:
+        """How far two orders may differ that a joint does not tell apart [1/rad]."""
+        return math.tau / max(float(np.ptp(self.looked.angle[:, i, axis])), 1e-9)
 
     def _orders(self, i: int, axis: int) -> Chosen:
         """Orders of the ripples that a torque at one joint would have to have, to be in what is left."""
