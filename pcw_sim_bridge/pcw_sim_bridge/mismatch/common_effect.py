@@ -32,7 +32,8 @@ def in_common(explanations: Sequence[Explanation], threshold: float) -> list[Exp
         threshold: evidence [nats] that all have to give together.
 
     Returns:
-        Explanations with the effect, its number and its probability as all have it; empty where there is none.
+        Explanations with the effect, its number and its probability as all have it; empty where there is none, or one
+        joint alone says it.
     """
     effects = _searched_by_one_number(explanations)
     if not effects:
