@@ -157,6 +157,15 @@ def test_a_task_that_fails_or_dies_takes_no_other_with_it() -> None:
     assert done["a"].peak_bytes > 2**20
 
 
+def test_linear_algebra_leaves_the_cores_to_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("threadpoolctl")
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    asked = "[pool['num_threads'] for pool in __import__('threadpoolctl').threadpool_info()]"
+    (done,) = run_tasks(eval, [("asked", (asked,))], 1)
+    assert done.error == "" and set(done.result) == {1}
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
