@@ -12,6 +12,7 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects
 from pcw_description.errors import DescriptionError
 from pcw_description.recording import Recording
+from pcw_sim_bridge.mismatch.challenge import cases
 from pcw_sim_bridge.mismatch.challenge.cases import (
     KINDS,
     MASKINGS,
@@ -291,6 +292,31 @@ def test_shares_are_as_stated_and_every_effect_has_its_turn() -> None:
 def test_what_is_not_allowed_is_named(changes: dict[str, object], named: str) -> None:
     with pytest.raises(MismatchError, match=named):
         order_cases(**{"count": 4, "seed": 0, **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("failures", "drawn"), [(2, 2), (9, 9), (99, None)])
+def test_a_case_is_drawn_until_a_robot_can_be_driven_so(
+    failures: int, drawn: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that never could be ended a whole challenge, as casters that were taken straight back turned either way."""
+    seen = iter(range(1000))
+
+    class Drawing:
+        def __init__(self, order: cases.CaseOrder, rng: np.random.Generator) -> None:
+            self.number = next(seen)
+
+        def answer(self) -> dict[str, object]:
+            if self.number < failures:
+                raise MismatchError("at no size that the robot can be driven with")
+            return {"effects": [{"size": 9.0, "evidence": 99.0}], "number": self.number}
+
+    monkeypatch.setattr(cases, "_Drawing", Drawing)
+    order = order_cases(1, 1)[0]
+    if drawn is None:
+        with pytest.raises(MismatchError, match="at no size"):
+            prepare_case(order)
+    else:
+        assert prepare_case(order)["number"] == drawn
 
 
 @pytest.mark.parametrize("masking", MASKINGS)

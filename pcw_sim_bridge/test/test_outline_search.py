@@ -90,6 +90,42 @@ def test_the_outline_of_a_patch_is_found_from_that_of_a_disc(outline):
     assert best <= tried.evidence.max() + 1e-6
 
 
+@pytest.mark.parametrize("seed", [8, 15, 17, 32])
+def test_a_small_patch_is_found_from_a_disc_far_too_large(seed):
+    """Four wheels cross a patch now and then, pushed either way or not at all: about all the places a large disc fits as well.
+
+    It is a hill of its own: outlines led from it to others beside the patch, worse by 20 to 40 nats.
+    """
+    rng = np.random.default_rng(seed)
+    turn, amplitude, phase = np.linspace(0.0, 2.0 * np.pi, 2000), rng.uniform(0.6, 1.0, 2), rng.uniform(0.0, 6.28, 3)
+    middle = np.column_stack([amplitude[0] * np.cos(turn + phase[0]), amplitude[1] * np.sin(2.0 * turn + phase[1])])
+    c, s = np.cos(turn + phase[2]), np.sin(turn + phase[2])
+    corners = [(0.25, 0.2), (0.25, -0.2), (-0.25, 0.2), (-0.25, -0.2)]
+    wheels = [middle + np.column_stack([x * c - y * s, x * s + y * c]) for x, y in corners]
+    pushed = [np.repeat(rng.choice([-1.0, 0.0, 1.0], 40), 50) for _ in wheels]
+    at, width = wheels[rng.integers(4)][rng.integers(2000)], rng.uniform(0.2, 0.4)
+    outline = {"x": at[0], "y": at[1], "length": width * rng.uniform(1.0, 2.0), "width": width, "yaw": rng.uniform(-1.0, 1.0)}
+    outline |= {"roundness": 0.0}
+    side = rng.uniform(1.2, 1.8)
+    apart, way = rng.uniform(0.3, 0.5) * side, rng.uniform(0.0, 6.28)
+    disc = DISC | {"x": at[0] + apart * np.cos(way), "y": at[1] + apart * np.sin(way), "length": side, "width": side}
+
+    def felt(shape: dict[str, float]) -> np.ndarray:
+        return np.stack([inside(places, shape) * push for places, push in zip(wheels, pushed)], axis=1)
+
+    residual = felt(outline) + NOISE * rng.standard_normal((2000, 4))
+    problem = floor_problem(wheels[0], outline, 0.0)
+    problem = dataclasses.replace(
+        problem, channels=tuple(Channel(f"axis_force/{k}", "N") for k in range(4)), measured=residual, residual=residual,
+        valid=np.ones_like(residual, dtype=bool),
+        terms=(dataclasses.replace(problem.terms[0], columns=lambda shape: felt(shape)[:, :, None]),),
+    )  # fmt: skip
+    regression = EffectSearch(problem, np.random.default_rng(0)).whiten_at(problem.residual)
+    found, _ = searched_outline(regression, (), shaped(disc))
+    best, true = (trial.evidence for trial in ShapeTrials(regression, (), found).tried([found, shaped(outline)]))
+    assert best > true - 4.0
+
+
 def test_where_few_wheels_crossed_a_patch_its_interval_holds_what_else_it_may_be():
     """One track each way: discs and rectangles of many directions do. Beside them each interval was below a centimetre.
 

@@ -3,7 +3,8 @@
 A few wheels cross a patch here and there. From the place that a first look finds an outline is led to the next one that
 fits there, and a disc never becomes the turned rectangle that fits better: the way from one to the other leads through what
 fits worse. So ellipses and rectangles of several directions and sizes are tried, the best are moved border by border, and
-those that differ most of what is then good are followed downhill in all numbers at once.
+those that differ most of what is then good are followed downhill in all numbers at once. A disc far too large, about the places
+where a small patch was crossed, is a hill of its own too: small discs all over it find the other one.
 
 What was tried on the way says also how well the outline is known: every one that fits nearly as well may be the true one.
 """
@@ -26,6 +27,9 @@ OUTLINE = ("x", "y", "length", "width", "yaw", "roundness")
 DIRECTIONS = (0.0, math.pi / 6.0, math.pi / 3.0)
 SIDES = (0.6, 0.85, 1.2)  # of the sides of the outline that was found
 STARTS = 6  # of them are moved
+SMALL = (0.2, 0.3)  # of the mean side: discs all over it and about it
+AROUND = 0.75  # mean sides from the middle to the furthest of them
+SMALL_STARTS = 2  # of each size are moved
 # Borders are moved by these parts of a side, the direction by twice as many radians, as long as that gains.
 STEPS = (0.4, 0.2, 0.1)
 MOVES = 6
@@ -96,6 +100,9 @@ def searched_outline(
         starts += list(near[:: math.ceil(len(near) / MOST_BEFORE)])
     order = 1 + np.argsort([-value for value in trials.evidence(starts)[1:]])
     reached = [trials.climb(starts[k]) for k in (0, *order[:STARTS])]
+    for small in _small_discs(own) if before is None else []:
+        best = np.argsort([-value for value in trials.evidence(small)])[:SMALL_STARTS]
+        reached += [trials.climb(small[k]) for k in best]
     trials.spread([*reached, *(starts[k] for k in order)])
     trials.settle()
     return trials.best(), trials.all_tried()
@@ -129,6 +136,16 @@ def _starts(own: FloatArray) -> list[FloatArray]:
     for roundness, yaw, length, width in itertools.product((0.0, 1.0), DIRECTIONS, SIDES, SIDES):
         if not (roundness == 1.0 and yaw > 0.0 and length == width and own[2] == own[3]):
             found.append(np.array([*own[:2], length * own[2], width * own[3], own[4] + yaw, roundness]))
+    return found
+
+
+def _small_discs(own: FloatArray) -> list[list[FloatArray]]:
+    """Discs of each small size, half of it apart, all over an outline."""
+    side, found = 0.5 * float(own[2] + own[3]), []
+    for size in np.multiply(SMALL, side):
+        steps = math.floor(AROUND * side / (0.5 * size))
+        places = 0.5 * size * np.arange(-steps, steps + 1)
+        found.append([np.array([own[0] + x, own[1] + y, size, size, 0.0, 1.0]) for x in places for y in places])
     return found
 
 

@@ -69,8 +69,9 @@ SHARE_OF_TWO_RECORDINGS = 0.25
 RETUNED_WITHIN = 2.0
 NOISE_RANGE = (0.5, 2.5)
 PROBES = 4
-# Draws of a case: one whose effects stay below the floor is drawn anew, but for the last.
-ATTEMPTS = 6
+# Draws of a case: one whose effects stay below the floor is drawn anew, but for the last. Where a motion takes casters straight
+# back, next to nothing decides which way each turns: such draws fail one after the other, and some other motion is found yet.
+ATTEMPTS, MOST_ATTEMPTS = 6, 40
 
 Answer = Mapping[str, Any]
 """Of one case. `case`, `kind`, `masking` (or null), `plant`, `controller`, `robot` (name), `noise` (factor on the sensors'),
@@ -181,7 +182,9 @@ def prepare_case(order: CaseOrder) -> Answer:
     """
     failures: list[str] = []
     faint: Answer | None = None
-    for attempt in range(ATTEMPTS):
+    for attempt in range(MOST_ATTEMPTS):
+        if faint is not None and attempt >= ATTEMPTS:
+            break
         try:
             answer = _Drawing(order, np.random.default_rng([*order.seed, attempt])).answer()
         except PcwError as error:
