@@ -3,8 +3,8 @@
 A few wheels cross a patch here and there. From the place that a first look finds an outline is led to the next one that
 fits there, and a disc never becomes the turned rectangle that fits better: the way from one to the other leads through what
 fits worse. So ellipses and rectangles of several directions and sizes are tried, the best are moved border by border, and
-those that differ most of what is then good are followed downhill in all numbers at once. A disc far too large, about the places
-where a small patch was crossed, is a hill of its own too: small discs all over it find the other one.
+those that differ most of what is then good are followed downhill in all numbers at once. A disc far too large, about all the
+places where a small patch was crossed, is a hill of its own too: small discs all over it find the other one.
 
 What was tried on the way says also how well the outline is known: every one that fits nearly as well may be the true one.
 """

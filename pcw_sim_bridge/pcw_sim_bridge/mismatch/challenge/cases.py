@@ -69,8 +69,8 @@ SHARE_OF_TWO_RECORDINGS = 0.25
 RETUNED_WITHIN = 2.0
 NOISE_RANGE = (0.5, 2.5)
 PROBES = 4
-# Draws of a case: one whose effects stay below the floor is drawn anew, but for the last. Where a motion takes casters straight
-# back, next to nothing decides which way each turns: such draws fail one after the other, and some other motion is found yet.
+# Draws of a case: one whose effects stay below the floor is drawn anew, but for the last. Where a motion takes casters
+# straight back, next to nothing decides which way each turns: such draws fail, and some other motion is found yet.
 ATTEMPTS, MOST_ATTEMPTS = 6, 40
 
 Answer = Mapping[str, Any]
