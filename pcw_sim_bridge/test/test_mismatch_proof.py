@@ -14,7 +14,7 @@ from pcw_description.contact.contact_model import tyre_parameters
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.robot_description import thinnest_module_inertia
-from pcw_sim_bridge.mismatch import law_models, proof
+from pcw_sim_bridge.mismatch import analysis, held_out, law_models, proof
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.all_cores import on_all_cores
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
@@ -23,6 +23,7 @@ from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm, explain
 from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
 from pcw_sim_bridge.mismatch.generated_effect import NoSuchKernelError
 from pcw_sim_bridge.mismatch.held_out import HeldOut
+from pcw_sim_bridge.mismatch.load_subject import load_subject
 from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
 from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.open_set import Leftover
@@ -590,6 +591,28 @@ def test_what_helps_held_out_is_proved_channel_by_channel(tmp_path: Path) -> Non
         (signal, horizon) for signal in ("position", "velocity") for horizon in (0.1, 0.5, 2.0)
     }
     assert [entry["name"] for entry in proof["per_channel"]] == ["axis_force"]
+
+
+def test_held_out_figures_show_what_the_proof_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They took what belongs to the residual that is exact where the patch is from that of the description.
+
+    Here an exact residual is 1 N more throughout.
+    """
+
+    def moved(problem: RegressionProblem, other: RegressionProblem) -> RegressionProblem:
+        return dataclasses.replace(other, residual=other.residual + 1.0, nominal=other.nominal_residual)
+
+    monkeypatch.setattr(held_out, "_exact_elsewhere", moved)
+    (tmp_path / "sled.yaml").write_text(SLED)
+    subject = load_subject(str(tmp_path / "sled.yaml"))
+    fit, other = sled(tmp_path, "fit.csv", 4.0, 1), sled(tmp_path, "other.csv", 4.0, 2)
+    findings = analysis.analyse(subject, [fit], [other], {}, 0, lambda message: None).findings
+    trace = next(trace for trace in findings.traces if trace.role == "holdout")
+    proved = next(channel for channel in findings.fit.channels if channel.name == trace.channel)
+    seen = np.isfinite(trace.measured)
+    spread = float(np.std(trace.measured[seen]))
+    for side, error in ((trace.before, proved.before), (trace.after, proved.after)):
+        assert np.sqrt(np.mean((trace.measured - side)[seen] ** 2)) / spread == pytest.approx(error, rel=1e-6)
 
 
 def test_without_other_recordings_manoeuvres_are_held_out(tmp_path: Path) -> None:

@@ -685,6 +685,44 @@ def test_a_number_that_no_healthy_system_has_is_no_rival_held_out():
     assert anything.help_of(0)[0] < 9.0
 
 
+def test_what_was_refined_where_the_problem_is_exact_is_held_out_as_it_was_fitted():
+    """A payload on a slope, its place refined once more: held out it had the columns of the description, without the slope.
+
+    Of a patch that took all but noise from other data the proof said that it took half.
+    """
+    time, rng = np.arange(SAMPLES) / RATE, np.random.default_rng(2)
+    first, refined = (("turn", 2.1),), (("turn", 2.13),)
+
+    def slope(turn: float) -> np.ndarray:
+        return np.sin(turn * time)[:, None]
+
+    def problem_of() -> RegressionProblem:
+        def model(size: float, turn: float) -> np.ndarray:
+            return size * (slope(turn) + 0.5 * np.cos(turn * time)[:, None])
+
+        measured = model(3.0, 2.13) + NOISE * rng.standard_normal((SAMPLES, 1))
+
+        def exact(changes, sizes):
+            at_work = [model(float(size.coefficients[0]), dict(size.shape)["turn"]) for size in sizes]
+            return measured - sum(at_work, np.zeros_like(measured)), []
+
+        term = Term(
+            "bent", ("axis",), (LinearParameter("size", "1", 0.0, 100.0, 3.0),), (dict(first),),
+            lambda shape: slope(shape["turn"])[:, :, None], is_exact=True, is_curved=True,
+        )
+        return one_channel(measured[:, 0], measured[:, 0], nuisances=(), terms=(term,), exact=exact)
+
+    fitted, other = problem_of(), problem_of()
+    fitted = fitted.exact_at({}, [SizedTerm(0, first, np.array([3.0]), (0,))]).around(0, first)
+    same = (Instance(0, refined, (0,)),)
+    selection = EffectSearch(fitted, np.random.default_rng(0)).conclude(same, 9.0)
+    held_out = HeldOut.recordings(fitted, same, same, selection, other)
+    left = held_out.problem.residual - held_out.predicted(held_out.means())
+    in_fit = fitted.residual - fitted.columns(0, refined)[:, :, 0] * selection.fit.mean[-1]
+    assert np.std(left) == pytest.approx(np.std(in_fit), rel=0.2)
+    assert np.std(left) < 0.2 * np.std(other.residual)
+
+
 def odds_of_second(residual: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     """Log odds of the worse of two terms against the better one, and the difference of their evidence; columns (T,)."""
     problem = linear_problem(residual, {"first": (first, 100.0), "second": (second, 100.0)})

@@ -344,6 +344,19 @@ def test_a_cogging_turns_with_the_wheel_and_not_with_what_is_read_of_it(tmp_path
         residual, _ = problem.exact({"steer_zero/rear_left": zero}, [size])
         left[zero] = float(np.sqrt(np.mean(residual[problem.valid[:, 2], 2] ** 2)))
     assert left[-0.02] < 0.5 * left[0.0]
+    # And so do its columns once the zero is known: four drives with zeros of their own had four coggings, or none.
+    turned = {"steer_zero/rear_left": -0.02}
+    (without, _), (with_it, _) = (problem.exact(turned, sizes) for sizes in ([], [size]))  # type: ignore[misc]
+    works = np.where(problem.valid, without - with_it, 0.0)
+    apart = []
+    for headed in (problem, problem.with_headings(turned)):
+        columns = headed.columns(place, size.shape) @ size.coefficients
+        apart.append(np.linalg.norm(np.where(problem.valid, columns, 0.0) - works) / np.linalg.norm(works))
+    assert apart[0] > 0.5
+    assert apart[1] < 0.1
+    assert problem.with_headings({"steer_zero/rear_left": 1e-3, "steer_zero/rear_right": 0.02}).terms[place].columns(
+        dict(size.shape)
+    ) == pytest.approx(problem.columns(place, size.shape))
 
 
 def test_a_tyre_near_its_peak_is_not_asked_how_much_it_slips() -> None:

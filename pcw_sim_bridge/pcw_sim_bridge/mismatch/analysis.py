@@ -148,6 +148,8 @@ def analyse(
         (False, False): "no_mismatch",
     }[bool(instances), bool(leftovers)]
     path = walked(problem, [subject.path(o) for o in opened])
+    # What was predicted is of it, and not of the description.
+    other = None if prover.other is None else proof.held_out.problem
     findings = Findings(
         subject=subject.name,
         verdict=verdict,
@@ -165,9 +167,9 @@ def analyse(
         ladder=(*_ladder(explanation.selection.ladder), *proof.dropped, *commands.ladder),
         traces=(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
-            *(_traces(prover.other, proof.predicted, explanation.fit, "holdout") if prover.other is not None else ()),
+            *(_traces(other, proof.predicted, explanation.fit, "holdout") if other is not None else ()),
         ),
-        notes=(*crowded, *_notes(explanation, retuned, prover.other is not None, proof, fit), *commands.notes),
+        notes=(*crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),

@@ -102,6 +102,9 @@ class EffectSearch(SetGrowth):
         if self.problem.point is not None and self.problem.point.derived:
             # Exact there, but with the columns of the description: those of effects are so, too, and are compared with them.
             self.problem = plain.exact_at(self.problem.point.changes, ())
+        if self.problem.point is not None:
+            headed = self.problem.point.changes
+            self.description, self.problem = self.description.with_headings(headed), self.problem.with_headings(headed)
         # Of all numbers this one moves far in healthy robots, and what every torque does hangs on it.
         self.problem = self.problem.with_soft_tyres()
         instances = self.over_complete()

@@ -238,8 +238,14 @@ def _exact_elsewhere(problem: RegressionProblem, other: RegressionProblem) -> Re
         coefficients = np.array([known.get(name, 0.0) for name in there])
         active = tuple(there.index(names[k]) for k in size.active if names[k] in there)
         sizes.append(SizedTerm(place, size.shape, coefficients, active))
-    exact = other.exact_at(problem.point.changes, sizes)
-    return exact.derived() if problem.point.derived else exact
+    exact = other.with_headings(problem.point.changes).exact_at(problem.point.changes, sizes)
+    exact = exact.derived() if problem.point.derived else exact
+    # What was exact at one shape, and then fitted at another one near it, has columns of the same kind here as there.
+    refined = {places[problem.terms[index].key] for index in problem.near if problem.terms[index].key in places}
+    for size in sizes:
+        if size.term in refined:
+            exact = exact.around(size.term, size.shape)
+    return exact
 
 
 def _positions(instances: Sequence[Instance], wanted: Collection[Instance]) -> tuple[int, ...]:

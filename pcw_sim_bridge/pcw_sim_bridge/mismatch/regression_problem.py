@@ -164,6 +164,8 @@ class Term:
             that the model misjudges.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
         recording: the only one in which it is at work; None: it is in all, at the same time.
+        headed: changes of the nuisances by name -> its columns where these turn what it is a function of; None where they
+            hardly do. None where it is a function of nothing that is re-tuned.
     """
 
     effect: str
@@ -186,6 +188,7 @@ class Term:
     unlike_errors: bool = False
     once: bool = False
     recording: int | None = None
+    headed: Callable[[Mapping[str, float]], Callable[[Shape], FloatArray] | None] | None = None
 
     @property
     def key(self) -> str:
@@ -436,6 +439,23 @@ class RegressionProblem:
         point = dataclasses.replace(self.point, derived=True)
         moved = dataclasses.replace(self, residual=residual, nuisances=tuple(nuisances), point=point)
         moved._remembered.update(self._remembered)
+        return moved
+
+    def with_headings(self, changes: Mapping[str, float]) -> RegressionProblem:
+        """Return the problem in which what ripples with a heading does so with the heading as these changes turn it.
+
+        A zero that is off by what may be turns a ripple of a high order by more than a right angle: what is one effect of all
+        casters would be another one of each, and none of them where the problem is exact.
+        """
+        headed = {k: term.headed(changes) for k, term in enumerate(self.terms) if term.headed is not None}
+        turned = {k: columns for k, columns in headed.items() if columns is not None}
+        if not turned:
+            return self
+        terms = tuple(
+            dataclasses.replace(term, columns=turned[k]) if k in turned else term for k, term in enumerate(self.terms)
+        )
+        moved = dataclasses.replace(self, terms=terms)
+        moved._remembered.update(self._without(*turned))
         return moved
 
     def with_soft_tyres(self) -> RegressionProblem:

@@ -39,6 +39,7 @@ from .robot_effects import torque_along
 
 DIRECTIONS = 8  # of a grid over all directions
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
+TURNED = 0.3  # [rad], of a ripple's phase, by a zero of the steering that was re-tuned; less is a detail
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
@@ -112,6 +113,14 @@ class _TermMaker:
                 )
             )
         arguments = [_ARGUMENT_NAMES[argument] for argument in kernel_arguments(effect.name)]
+        orders = [shape[p.name] for shape in shapes for p in effect.nonlinear_parameters if p.unit == "1/rad"]
+
+        def headed(changes: Mapping[str, float]) -> Columns | None:
+            turned = [changes.get(f"steer_zero/{name}", 0.0) for name in target]
+            if max(map(abs, turned)) * max(orders) < TURNED:
+                return None
+            return lambda shape: self._joint_columns(effect, target, axis, shape, turned)
+
         return Term(
             effect=effect.name,
             axis=axis,
@@ -126,12 +135,14 @@ class _TermMaker:
             grid_size=among,
             is_exact=True,
             noisy="force" in kernel_arguments(effect.name),
+            headed=headed if orders and (axis or effect.axis) == "steer" else None,
         )
 
     def _joint_columns(
-        self, effect: JointTorqueEffect, target: Sequence[str], axis: str | None, shape: Shape
+        self, effect: JointTorqueEffect, target: Sequence[str], axis: str | None, shape: Shape,
+        turned: Sequence[float] | None = None,
     ) -> FloatArray:
-        """Columns (T, C, P) of an effect at work on some casters with common parameters."""
+        """Columns (T, C, P) of an effect at work on some casters with common parameters, each turned [rad] by so much."""
         column = AXIS_NAMES.index(axis or effect.axis)
         casters = [self.robot.caster_index(name) for name in target]
         torques = []
@@ -142,9 +153,10 @@ class _TermMaker:
 
         for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
             found = np.zeros((*motion.position.shape, len(effect.linear_parameters)))
-            for i in casters:
+            for i, by in zip(casters, turned or len(casters) * [0.0], strict=True):
                 signals = motion.position, motion.velocity, motion.balanced_torque
                 position, velocity, force = (s[:, i, column] for s in signals)
+                position = position + by
                 found[:, i, column] = torque_along(effect, (position, velocity, force, normal[:, i]), parts)
             torques.append(found)
         return self.differences.of_torque(torques)
