@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import os
 import signal
 import subprocess
 import sys
@@ -300,3 +301,11 @@ def test_a_log_in_use_is_refused_before_anything_is_opened(tmp_path):
     (tmp_path / "x.log").touch()
     with pytest.raises(CanError, match="exists already"):
         FrameLogWriter(tmp_path / "x.log")
+
+
+def test_a_list_of_buses_without_the_program_that_shows_them_says_so(tmp_path):
+    """python-can logs a traceback where `ip` is not installed, as in a small container."""
+    command = [sys.executable, "-m", COMMANDS["can_doctor"], "--list"]
+    done = subprocess.run(command, env=os.environ | {"PATH": str(tmp_path)}, capture_output=True, text=True, timeout=60.0)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "`ip` (iproute2) is not installed" in done.stdout

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shutil
 import sys
 from collections.abc import Sequence
 
@@ -61,11 +62,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _list() -> int:
     from .python_can import available_buses
 
-    logging.getLogger("can").setLevel(logging.ERROR)  # what it lacks for the interfaces that are not here
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # what it lacks for the interfaces that are not here
     found = available_buses()
     for bus in found:
         print(", ".join(f"{key} {value}" for key, value in bus.items()))
-    if not found:
+    if shutil.which("ip") is None:  # python-can asks it; containers often lack it
+        print("interfaces of socketcan are not listed: `ip` (iproute2) is not installed; a bus may be there all the same")
+    elif not found:
         print("python-can finds no bus here; `ip link` shows the interfaces of socketcan")
     return 0
 
