@@ -148,7 +148,7 @@ def analyse(
         (False, False): "no_mismatch",
     }[bool(instances), bool(leftovers)]
     path = walked(problem, [subject.path(o) for o in opened])
-    # What was predicted is of it, and not of the description.
+    # The prediction belongs to the residual that is exact where the patch is, not to that of the description.
     other = None if prover.other is None else proof.held_out.problem
     findings = Findings(
         subject=subject.name,

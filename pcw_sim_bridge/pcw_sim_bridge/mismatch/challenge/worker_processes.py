@@ -99,7 +99,7 @@ def _handed(worker: _Worker, waiting: list[tuple[str, tuple[Any, ...]]]) -> _Wor
 
 def _serve(connection: Connection, function: Callable[..., Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends us
-    one_thread()  # those of linear algebra would spin on the cores of the other workers
+    one_thread()  # threads of linear algebra would spin on the cores of the other workers
     os.dup2(2, 1)  # an engine that prints when it is loaded does not print among the parent's results
     while True:
         try:
