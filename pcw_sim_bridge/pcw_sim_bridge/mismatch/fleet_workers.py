@@ -11,6 +11,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from pcw_description.one_heap import one_heap
+
 from .errors import MismatchError
 
 # Tasks per worker that are handed out beyond the one it works at, so that it never waits.
@@ -74,6 +76,7 @@ class LocalWorkers:
 def _begin_worker() -> None:
     """Leave Ctrl-C to the process that handed out the work, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    one_heap()
     parent = multiprocessing.parent_process()
     if parent is not None:
 

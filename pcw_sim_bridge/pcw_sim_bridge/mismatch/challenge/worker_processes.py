@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pcw_description.errors import PcwError
+from pcw_description.one_heap import one_heap
 from pcw_description.one_thread import one_thread
 
 
@@ -100,6 +101,7 @@ def _handed(worker: _Worker, waiting: list[tuple[str, tuple[Any, ...]]]) -> _Wor
 def _serve(connection: Connection, function: Callable[..., Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends us
     one_thread()  # threads of linear algebra would spin on the cores of the other workers
+    one_heap()
     os.dup2(2, 1)  # an engine that prints when it is loaded does not print among the parent's results
     while True:
         try:

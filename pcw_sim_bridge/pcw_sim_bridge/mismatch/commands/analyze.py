@@ -54,6 +54,7 @@ def remapped_topics(remaps: Sequence[str]) -> dict[str, str]:
 
 def run(options: argparse.Namespace) -> int:
     """Analyse, write the report, print its path and five lines."""
+    from pcw_description.one_heap import one_heap
     from pcw_description.one_thread import one_thread
 
     from ..analysis import analyse
@@ -61,6 +62,7 @@ def run(options: argparse.Namespace) -> int:
     from ..report import check_output, write_report
 
     one_thread()  # the analysis has its own, see `all_cores`: those of linear algebra would take turns with them, and spin
+    one_heap()
     gc.freeze()  # what has been imported stays; to look through all of it for garbage at the end takes half a second
     topics = remapped_topics(options.topic)
     for path in (*options.recordings, *options.holdout):
