@@ -124,7 +124,6 @@ class SimulatedRobot:
         self.plant, self.robot = plant, robot
         self.command_timeout = command_timeout
         self._seed = seed
-        self._step_ns = round(plant.dt * NANOSECONDS)
         self._encoders = Encoders(robot, velocity_source)
         self._imu = Imu(as_it_really_is(robot)) if sensors.imu else None
         self._loops = VelocityLoops(robot, velocity_bandwidth, plant.dt)
@@ -151,7 +150,7 @@ class SimulatedRobot:
     @property
     def time_ns(self) -> int:
         """Simulated time [ns]."""
-        return self.steps * self._step_ns
+        return round(self.steps * self.plant.dt * NANOSECONDS)
 
     @property
     def control_period(self) -> float:

@@ -212,6 +212,17 @@ def test_what_is_within_tolerance_has_hardly_any_evidence(channels: HealthyChann
     assert found[1].evidence > 18.0
 
 
+def test_what_is_a_curved_number_has_no_more_evidence_than_its_tolerance_costs(channels: HealthyChannels) -> None:
+    """First orders at the description led past the relaxation length, back, and past it again: 386 nats for 8 tolerances."""
+    tolerance = THESIS.contact.relaxation_length * THESIS.tolerance("contact.relaxation_length").value
+    for times in (3.0, 8.0):
+        length = THESIS.contact.relaxation_length + times * tolerance
+        effect = effect_instance("tyre_relaxation", THESIS.caster_names, {"length": length})
+        found = channels.size([simulate(world().quiet(), RUN, [effect])], [effect])
+        assert found.size > 10.0
+        assert found.evidence < 0.5 * times**2 + 3.0
+
+
 @pytest.mark.parametrize(
     ("name", "target", "parameters", "numbers"),
     [

@@ -15,13 +15,20 @@ from pcw_sim_bridge.mismatch.command_tracking import command_problems
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.plants.factory import make_plant
 
-# Its joint states come at 300 Hz, so that commands are held over 3, 3 and 4 ms in turn.
 ROBOT = load_robot("dyros_pcv")
 
 
+class UnevenWorld(World):
+    """A loop that does not keep its time: in steps of 1 ms, commands at 300 Hz are held over 3, 3 and 4 ms in turn."""
+
+    def make(self, robot, effects):
+        return make_plant(self.plant, robot, 1e-3)
+
+
 def found(*effects, robot=ROBOT):
-    recording = simulate(World(robot, robot, "reduced"), Run("run", "identification", 15.0, 3), effects)
+    recording = simulate(UnevenWorld(robot, robot, "reduced"), Run("run", "identification", 15.0, 3), effects)
     return command_findings(command_problems(robot, [recording]), (), 0, None, lambda message: None)
 
 

@@ -56,6 +56,12 @@ def test_every_sensor_keeps_its_rate_without_drift(joints, imu, tracker):
         assert np.all(times - ideal > -1e-9) and np.all(times - ideal < 1e-3)
 
 
+@pytest.mark.parametrize("rate", [300.0, 120.0, 500.0, 2000.0])
+def test_the_periods_of_the_drives_are_even(rate):
+    times = stamps(run(simulated(robot_with_rates(rate, 100.0, 100.0)), 0.5), JointReading)
+    assert np.ptp(np.diff(times)) < 2e-9
+
+
 def test_samples_come_in_order_and_each_period_ends_with_the_joints():
     robot = simulated()
     list(robot.advance())

@@ -42,7 +42,10 @@ class BridgeNode(Node):
         super().__init__("bridge")
         robot = load_robot(declare(self, "robot", "thesis", "robot file, or the name of a shipped robot", read_only=True))
         plant = declare(self, "plant", "reduced", "what computes the motion", read_only=True, choices=PLANT_NAMES)
-        dt = declare(self, "dt", 0.001, "step of the plant", "s", (1e-4, 5e-3), read_only=True)
+        dt = declare(
+            self, "dt", 0.0, "step of the plant; 0: the longest up to 1 ms that fits the encoders", "s", (0.0, 5e-3),
+            read_only=True,
+        )
         seed = declare(self, "seed", 0, "seed of the sensor noise", range=(0, 2**31 - 1), read_only=True)
         lifted = declare(self, "lifted", False, "the robot is on a jack, its wheels off the ground", read_only=True)
         gui = declare(self, "gui", False, "show the plant's window (pybullet, mujoco)", read_only=True)
@@ -68,7 +71,7 @@ class BridgeNode(Node):
 
         all_declared(self)
         self.robot = robot
-        self._simulated = SimulatedRobot(make_plant(plant, robot, dt, gui, lifted), seed, source, timeout, bandwidth)
+        self._simulated = SimulatedRobot(make_plant(plant, robot, dt or None, gui, lifted), seed, source, timeout, bandwidth)
         for _ in range(3):  # compiles everything before the clock starts
             list(self._simulated.advance())
         self._simulated.reset()

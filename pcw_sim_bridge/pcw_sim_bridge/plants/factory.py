@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import math
+
 from pcw_description.robot_description import RobotDescription
 
 from .plant import PLANT_NAMES, Plant, PlantError
 from .reduced import ReducedPlant
 
+LONGEST_STEP, SHORTEST_STEP = 1e-3, 1e-4  # [s], by default
 
-def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool = False, lifted: bool = False) -> Plant:
+
+def fitting_step(rate: float) -> float:
+    """Return the longest step [s] up to 1 ms of which the period of a control loop at `rate` [Hz] is a whole number.
+
+    Periods of three steps and of four in turn would shake a robot, in step with its sensors: an accelerometer that is read
+    at every tenth step showed a tenth too little.
+    """
+    return max(1.0 / (rate * max(math.ceil(1.0 / (rate * LONGEST_STEP) - 1e-9), 1)), SHORTEST_STEP)
+
+
+def make_plant(
+    name: str, robot: RobotDescription, dt: float | None = None, gui: bool = False, lifted: bool = False
+) -> Plant:
     """Make a plant of the robot.
 
     Args:
         name: "reduced" (planar, compiled), "pybullet" or "mujoco" (three-dimensional).
         robot: the robot, with the effects of its `physics` at work.
-        dt: step [s].
+        dt: step [s]; None: what fits the robot's encoders, see `fitting_step`.
         gui: show a window (not of the reduced plant).
         lifted: on a jack, the wheels off the ground.
 
@@ -24,6 +39,8 @@ def make_plant(name: str, robot: RobotDescription, dt: float = 1e-3, gui: bool =
     """
     if name not in PLANT_NAMES:
         raise PlantError(f"plant {name!r} is not allowed; allowed: {', '.join(PLANT_NAMES)}")
+    if dt is None:
+        dt = fitting_step(robot.sensors.encoders.rate)
     if not 1e-4 <= dt <= 5e-3:
         raise PlantError(f"dt = {dt!r} s is not allowed; allowed: 0.0001 to 0.005 s")
     robot.require_torque_control()
