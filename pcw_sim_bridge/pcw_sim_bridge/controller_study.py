@@ -391,7 +391,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     document.add(
         "# Controllers of thesis sections 5.1 and 5.2", "",
         f"Written by `python -m pcw_sim_bridge.controller_study --seeds {options.seeds}`; nothing here is typed in. All runs "
-        "are with the sensors of the robot files at 500 Hz, torque limits included.", "",
+        "are with the sensors of the robot files at their rates, torque limits included.", "",
     )
     figure_5_2(document)
     figure_5_3(document)
