@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,9 @@ import pytest
 from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.robot_motion import SMALLEST_CUTOFF, choose_cutoff
+from pcw_sim_bridge.mismatch.robot_effects import with_pose
+from pcw_sim_bridge.mismatch.robot_motion import SMALLEST_CUTOFF, choose_cutoff, read_motions
+from pcw_sim_bridge.mismatch.rolling_model import ModelNumbers
 from pcw_sim_bridge.mismatch.signal_filter import interpolated
 from pcw_sim_bridge.simulated_run import record_run
 
@@ -40,6 +43,28 @@ def made_of(recording: Recording, highest: float) -> Any:
     rng = np.random.default_rng(1)
     slow = sum(np.sin(2.0 * np.pi * f * stamp + f) for f in np.arange(0.5, highest + 0.1, 0.5))
     return with_torques(recording, slow[:, None, None] + 0.05 * rng.standard_normal(effort.shape))
+
+
+def test_a_tracked_place_counts_though_the_tracker_begins_late_and_misses_some(lively: Recording) -> None:
+    """One sample before the tracker's first, and all places came from the wheels: a patch was sought a metre away."""
+    [motion] = read_motions(THESIS, lively, 0, 5.0, True)
+    tracked = with_pose([motion], ModelNumbers.of(THESIS))[0].pose
+    part = len(tracked) // 10
+    for missing in ([slice(0, 3)], [slice(-part, None)], [slice(0, part), slice(4 * part, 5 * part), slice(-3, None)]):
+        pose = tracked.copy()
+        for some in missing:
+            pose[some] = np.nan
+        larger = THESIS.with_casters(THESIS.caster_names, lambda c: dataclasses.replace(c, wheel_radius=1.2 * c.wheel_radius))
+        wrong = ModelNumbers.of(larger)
+        [found] = with_pose([dataclasses.replace(motion, pose=pose)], wrong)
+        known = np.isfinite(pose).all(axis=1)
+        assert np.array_equal(found.pose[known], tracked[known])
+        # What the wheels make of the way meanwhile, too long by their radius, and ten times the noise of the tracker.
+        way = np.abs(np.diff(tracked, axis=0))[~known[1:]].sum(axis=0).max()
+        assert np.abs(found.pose - tracked).max() < 0.3 * way + 5e-3
+    [blind] = with_pose([dataclasses.replace(motion, pose=np.full_like(tracked, np.nan))], ModelNumbers.of(THESIS))
+    assert np.array_equal(blind.pose[0], np.zeros(3))
+    assert np.abs(blind.pose - tracked).max() < 0.02
 
 
 def test_channels_end_where_torques_tell_nothing_more(lively: Recording) -> None:

@@ -54,7 +54,7 @@ from pcw_description.effects.registry import get
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER, RobotDescription
 
 from .axis_channels import kernel_arguments
-from .regression_problem import FloatArray
+from .regression_problem import BoolArray, FloatArray
 from .robot_motion import RobotMotion
 from .rolling_model import (
     NOTHING,
@@ -82,29 +82,60 @@ RIPPLE_TAPS, RIPPLE_CUTOFF = 96, 0.38
 
 
 def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
-    """Return the motions with a pose everywhere: where none was tracked, from the wheels, zero where a recording begins.
+    """Return the motions with a pose everywhere: from the wheels where none was tracked.
 
-    Over a gap the twist goes in a line from its last value to its next.
+    Beside what was tracked the wheels go on from there, or lead there; over a gap in it they are put right at both ends.
+    Without any they go on from the piece before, over the gap with a twist in a line from its last value to its next, or
+    begin at zero.
     """
     found: list[RobotMotion] = []
     last_rate = np.zeros(3)
     for motion in motions:
-        if np.isfinite(motion.pose).all():
+        known = np.asarray(np.isfinite(motion.pose).all(axis=1), dtype=bool)
+        if known.all():
             found.append(motion)
             continue
         twist = twists(numbers, numbers.headings(motion.position), motion.velocity)[0]
-        pose = np.zeros((len(twist), 3))
-        if found and found[-1].recording == motion.recording:
-            pose[0] = found[-1].pose[-1] + 0.5 * (last_rate + twist[0]) * (motion.time[0] - found[-1].time[-1])
-        steps = np.diff(motion.time)
-        pose[:, 2] = pose[0, 2] + _integral(twist[:, 2], steps)
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        pose[:, 0] = pose[0, 0] + _integral(c * twist[:, 0] - s * twist[:, 1], steps)
-        pose[:, 1] = pose[0, 1] + _integral(s * twist[:, 0] + c * twist[:, 1], steps)
+        if known.any():
+            pose = _completed(motion.pose, known, twist, motion.time)
+        else:
+            start = np.zeros(3)
+            if found and found[-1].recording == motion.recording:
+                start = found[-1].pose[-1] + 0.5 * (last_rate + twist[0]) * (motion.time[0] - found[-1].time[-1])
+            pose = _rolled(start, twist, motion.time)
         found.append(dataclasses.replace(motion, pose=pose))
         vx, vy, omega = twist[-1]
-        last_rate = np.array([c[-1] * vx - s[-1] * vy, s[-1] * vx + c[-1] * vy, omega])
+        c, s = np.cos(pose[-1, 2]), np.sin(pose[-1, 2])
+        last_rate = np.array([c * vx - s * vy, s * vx + c * vy, omega])
     return found
+
+
+def _completed(pose: FloatArray, known: BoolArray, twist: FloatArray, time: FloatArray) -> FloatArray:
+    """Poses (T, 3) where they are known (T,), and elsewhere as a twist (T, 3) leads from one to the next."""
+    completed = pose.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], known, [True]])))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if first == 0:
+            back = slice(last, None, -1)
+            completed[back] = _rolled(pose[last], twist[back], time[back])
+            continue
+        way = slice(first - 1, last + 1)
+        rolled = _rolled(pose[first - 1], twist[way], time[way])
+        if last < len(pose):
+            part = (time[way] - time[first - 1]) / (time[last] - time[first - 1])
+            rolled += part[:, None] * (pose[last] - rolled[-1])
+        completed[way] = rolled
+    return completed
+
+
+def _rolled(start: FloatArray, twist: FloatArray, time: FloatArray) -> FloatArray:
+    """Poses (T, 3) from the first one on with a twist (T, 3) in the body's axes; times may go backwards."""
+    steps = np.diff(time)
+    yaw = start[2] + _integral(twist[:, 2], steps)
+    c, s = np.cos(yaw), np.sin(yaw)
+    x = start[0] + _integral(c * twist[:, 0] - s * twist[:, 1], steps)
+    y = start[1] + _integral(s * twist[:, 0] + c * twist[:, 1], steps)
+    return np.column_stack([x, y, yaw])
 
 
 def _integral(values: FloatArray, steps: FloatArray) -> FloatArray:
