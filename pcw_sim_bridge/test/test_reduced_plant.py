@@ -156,7 +156,7 @@ def test_gentle_push_follows_the_augmented_object(name: str) -> None:
     torque = np.zeros((robot.n, 2))
     torque[:, DRIVE] = 0.02 * robot.contact.mu_p * robot.total_mass * 9.81 * robot.wheel_radius / robot.n
     plant.reset(steer_angle=np.full(robot.n, 0.3))
-    plant.step(torque, 1000)
+    plant.step(torque, round(1.0 / plant.dt))
     state = plant.state()
     speed = np.hypot(*state.twist[:2])
     inertia, _ = AugmentedObjectModel(robot).evaluate(np.full(robot.n, 0.3), np.zeros(3))
