@@ -16,7 +16,7 @@ def fitting_step(rate: float) -> float:
     """Return the longest step [s] up to 1 ms of which the period of a control loop at `rate` [Hz] is a whole number.
 
     Periods of three steps and of four in turn would shake a robot, in step with its sensors: an accelerometer that is read
-    at every tenth step showed a tenth too little.
+    at every tenth step shows less than there is.
     """
     return max(1.0 / (rate * max(math.ceil(1.0 / (rate * LONGEST_STEP) - 1e-9), 1)), SHORTEST_STEP)
 
