@@ -274,6 +274,14 @@ def test_the_page_has_every_figure_and_every_miss(tmp_path: Path) -> None:
     assert confusion.rows[0] == ("drive_coulomb_friction", "2", "0", "1", "0", "rolling_resistance 1")
 
 
+def test_what_is_named_as_often_stands_in_the_order_of_its_name(tmp_path: Path) -> None:
+    others = ("rolling_resistance", "imu_scale", "drive_viscous_friction", "imu_scale")
+    wrong = [(SINGLE, report(named(other, "rear_left"))) for other in others]
+    found = score([CaseSet(tmp_path / "ch", challenge(tmp_path / "ch", wrong))], lambda message: None)
+    [confusion] = [table for table in found.tables if table.title == "Concealed and named"]
+    assert confusion.rows[0][-1] == "imu_scale 2, drive_viscous_friction 1, rolling_resistance 1"
+
+
 def test_cases_of_several_seeds_are_counted_together(tmp_path: Path) -> None:
     sealed = challenge(tmp_path / "one" / "ch", [(SINGLE, report(named()))])
     wrong = report(named("rolling_resistance", "rear_left"))

@@ -122,6 +122,12 @@ def hard_spot(state: PlantState, motor: np.ndarray) -> np.ndarray:
     return torque
 
 
+def small_drag(state: PlantState, motor: np.ndarray) -> np.ndarray:
+    """A drag of all steerings by the square of their speed."""
+    speed = state.joint_velocity[:, 1]
+    return np.stack([np.zeros(4), -0.005 * abs(speed) * speed], axis=1)
+
+
 def uneven_gain(state: PlantState, motor: np.ndarray) -> np.ndarray:
     """A motor 2 % stronger one way than the other; named a constant load by who does not look."""
     torque = np.zeros((4, 2))
@@ -221,6 +227,14 @@ def test_a_quadratic_drag_is_no_viscous_friction_beside_it(excitation, seed, tmp
     assert (findings.verdict, findings.effects) == ("unexplained", ())
     [unknown] = findings.unknown
     assert unknown.depends_on == ("steer_velocity/front_right",)
+
+
+def test_a_small_drag_of_all_steerings_is_no_viscous_friction(tmp_path, monkeypatch):
+    """It is a fair part of the friction that looks most like it, though not of what is measured."""
+    findings = analysed(record(tmp_path / "run", small_drag, 3, monkeypatch, "random_goals", 40.0)).findings
+    assert (findings.verdict, findings.effects) == ("unexplained", ())
+    [unknown] = findings.unknown
+    assert unknown.depends_on[0] == "steer_velocity/front_left"
 
 
 def loaded(effect: GeneratedEffect, folder: Path) -> Effect:

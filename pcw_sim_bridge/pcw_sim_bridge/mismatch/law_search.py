@@ -25,7 +25,7 @@ from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
-from .regression_problem import FloatArray, RegressionProblem
+from .regression_problem import FloatArray, RegressionProblem, Term
 from .unknown_law import Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -46,6 +46,8 @@ SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
 KEPT_PART = 0.02
 # A law that replaces a name must differ from it by this part of what the name does.
 REPLACED_PART = 0.15
+# A name whose law is changed has shown itself where it moves channels, in deviations of what is left, by this part of most.
+CLEAR_PART = 0.5
 # So much smaller than all that was measured a law may be expected to be that stands for a name.
 SMALLER_PARTS = (0.3, 0.1, 0.03, 0.01)
 MENDING_PART = 0.05
@@ -167,6 +169,10 @@ class LawSearch:
             # Any drag is also a function of the torque that overcomes it, which must not crowd out what it really is.
             allowed = (laws[k] for k in ranked if not self._undoes_a_motor(laws[k], scores[k][1]))
             chosen += itertools.islice(allowed, FINALISTS)
+            # A name may be of the right thing and of the wrong function: that is the first suspect.
+            for name in self.names:
+                own = (laws[k] for k in ranked if changes_law_of(laws[k], self.problem.terms[name.term]))
+                chosen += itertools.islice(own, 1)
         return list(dict.fromkeys(chosen))
 
     # -- finalists ----------------------------------------------------------------------------------------------
@@ -248,27 +254,38 @@ class LawSearch:
     ) -> bool:
         """Whether the law moves the prediction of some channel by more than details and misjudgements of the model.
 
-        Against a name that it replaces it is enough to differ by a fair part of what the name does. That something is there
-        the name has shown; the model misjudges it by no more than it misjudges everything. Details are the same at all times:
-        what changes with the time may be a smaller part of what is measured.
+        Against a name that it replaces, or whose own law it changes, it is enough to differ by a fair part of what the name
+        does. That something is there the name has shown; the model misjudges it by no more than it misjudges everything.
+        Details are the same at all times: what changes with the time may be a smaller part of what is measured.
         """
         after = predicted(problem, with_law)
         change, left = after - predicted(problem, without), problem.residual - after
-        replaced = np.zeros_like(change)
+        blank = np.where(problem.valid, 1.0, np.nan)
+        channels = np.flatnonzero(problem.valid.any(axis=0))
+
+        def sizes(values: FloatArray) -> FloatArray:
+            return np.asarray(np.sqrt(np.nanmean((values * blank)[:, channels] ** 2, axis=0)), dtype=np.float64)
+
+        noise = np.array([robust_deviation(left[problem.valid[:, c], c]) for c in channels])
+        replaced, changed = np.zeros_like(change), np.zeros_like(change)
         position = len(problem.nuisances)
         for instance, drop in zip(without.instances, dropped, strict=True):
+            term = problem.terms[instance.term]
             columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
-            replaced += drop * (columns @ without.mean[position : position + len(instance.active)])
+            does = columns @ without.mean[position : position + len(instance.active)]
             position += len(instance.active)
+            if drop:
+                replaced += does
+            elif changes_law_of(law, term):
+                changed += does
+        shown = sizes(changed) / np.maximum(noise, 1e-300)
+        names = sizes(replaced) + np.where(shown >= CLEAR_PART * shown.max(initial=0.0), sizes(changed), 0.0)
         guessed = False
-        for channel in range(change.shape[1]):
+        for channel, size, signal, own, beside in zip(
+            channels, sizes(change), sizes(problem.measured), names, noise, strict=True
+        ):
             valid = problem.valid[:, channel]
-            if not valid.any():
-                continue
-            sizes = [float(np.sqrt(np.mean(v[valid, channel] ** 2))) for v in (change, problem.measured, replaced)]
-            size, signal, own = sizes
             enough = 0.0 if "time" in law.depends_on else max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
-            beside = robust_deviation(left[valid, channel])
             if own > 0.0:
                 enough = min(enough, REPLACED_PART * own)
                 beside = min(beside, own)  # a name that lies below the noise gives way to a law that lies below it
@@ -289,6 +306,11 @@ def _is_fast(law: Law) -> bool:
     own = {place.site.replace("torque", "velocity") for place in law.places}
     names = {name for place in law.places for argument in place.arguments for name, _ in argument}
     return bool(own & names) and all(place.factor == Factor() for place in law.places)
+
+
+def changes_law_of(law: Law, term: Term) -> bool:
+    """Whether a law is another function of what a name is a function of, at the place of that name."""
+    return _same_place(law, term.target) and set(law.depends_on) <= set(term.arguments)
 
 
 def _same_place(law: Law, target: Sequence[str]) -> bool:

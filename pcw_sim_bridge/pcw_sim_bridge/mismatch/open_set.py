@@ -22,7 +22,7 @@ from scipy import linalg
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
-from .law_search import LAW_MARGIN, FoundLaw, LawSearch, gain_of_a_smaller_law
+from .law_search import LAW_MARGIN, FoundLaw, LawSearch, changes_law_of, gain_of_a_smaller_law
 from .leftover_expression import ClosedForm, closed_form, fourier, written
 from .noise_model import robust_deviation
 from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem
@@ -48,6 +48,8 @@ LIBRARY_TRIALS = 3
 MOST_PROMISING, PROMISING_SAMPLES = 4, 500
 # A closed form may leave this part more of what a curve explains; and this, if it does without a name that the curve needs.
 CLOSED_PART, SIMPLER_PART = 0.01, 0.05
+# Nats by which a law has to do better without a name whose law it changes, if it needs as many numbers.
+AGAINST_A_NAME = 3.0
 # What is left of the probability of a name that a curve of the same argument can hold to this part of its square.
 SHARED_BELIEF, HELD_PART = 0.5, 0.5
 
@@ -226,30 +228,58 @@ def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> 
 
 
 def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tuple[EffectSearch, Selection, Law]:
-    """Put a law into the joint fit: as a closed form if it does as well as the curve."""
-    curve = _with_law(search, selection, found.law, found.names)
+    """Put a law into the joint fit, in place of a name whose law it changes if the recording speaks against that name.
+
+    Beside a viscous friction what is left of a drag by the square of the speed looks like one by its cube.
+    """
+    beside = _adopted_beside(search, selection, found, found.names)
+    terms = search.problem.terms
+    others = tuple(i for i in found.names if not changes_law_of(found.law, terms[i.term]))
+    if len(others) == len(found.names):
+        return beside
+    alone = _adopted_beside(search, selection, found, others)
+    if not isinstance(alone[2].basis, ClosedForm):
+        return beside
+    residual = beside[0].residual_of(beside[1].fit.instances)
+    evidences = [s.whiten_at(residual).fit(chosen.fit.instances).log_evidence for s, chosen, _ in (beside, alone)]
+    needed = AGAINST_A_NAME
+    if _size(alone[1]) < _size(beside[1]):
+        needed = -SIMPLER_PART * (evidences[0] - search.whiten_at(residual).fit(found.names).log_evidence)
+    return alone if evidences[1] > evidences[0] + needed else beside
+
+
+def _size(selection: Selection) -> int:
+    """How many numbers a selection fits."""
+    return sum(len(instance.active) for instance in selection.fit.instances)
+
+
+def _adopted_beside(
+    search: EffectSearch, selection: Selection, found: FoundLaw, names: tuple[Instance, ...]
+) -> tuple[EffectSearch, Selection, Law]:
+    """Put a law into the joint fit beside names: as a closed form if it does as well as the curve."""
+    curve = _with_law(search, selection, found.law, names)
     weights, covariance = _weights_of(*curve, found.law)
     form = closed_form(found.law.basis, weights, covariance)
     if form is None:
         return *curve, found.law
     form = _as_far_as_seen(search.problem, found.law, form)
     law = dataclasses.replace(found.law, basis=form)
-    closed = _with_law(search, selection, law, found.names)
+    closed = _with_law(search, selection, law, names)
     valid = search.problem.valid
     residuals = [s.residual_of(c.fit.instances) for s, c in (curve, closed)]
-    residuals.append(search.residual_of(found.names))
+    residuals.append(search.residual_of(names))
     deviation = np.array([robust_deviation(residuals[0][valid[:, c], c]) for c in range(valid.shape[1])])
     sizes = [float(np.sum(np.where(valid, residual / deviation, 0.0) ** 2)) for residual in residuals]
     part = (sizes[1] - sizes[0]) / max(sizes[2] - sizes[0], 1e-300)
     if part < SIMPLER_PART:
         law = _without_what_names_hold(*closed, law, form)
-        closed = _with_law(search, selection, law, found.names)
+        closed = _with_law(search, selection, law, names)
         simpler = _without_redundant(*closed)
-        if part < CLOSED_PART or len(simpler.fit.instances) <= len(found.names):
+        if part < CLOSED_PART or len(simpler.fit.instances) <= len(names):
             return closed[0], simpler, law
     if found.law.basis.kind == "periodic":
         law = dataclasses.replace(found.law, basis=fourier(found.law.basis))
-        return *_with_law(search, selection, law, found.names), law
+        return *_with_law(search, selection, law, names), law
     return *curve, found.law
 
 

@@ -341,9 +341,10 @@ def _confusion(judged: Sequence[Judgement]) -> Table:
         said: Counter[str] = Counter()
         for j in own:
             said.update({n.key[0] for n in j.named if n.key not in j.truth} or ([] if j.named else [j.outcome]))
+        most = sorted(said.items(), key=lambda item: (-item[1], item[0]))
         rows.append((
             name, str(len(own)), str(sum(not j.above_floor for j in own)), str(outcomes["right"]),
-            str(outcomes["in a look-alike set"]), ", ".join(f"{other} {count}" for other, count in said.most_common()),
+            str(outcomes["in a look-alike set"]), ", ".join(f"{other} {count}" for other, count in most),
         ))
     return Table(
         "Concealed and named", ("concealed", "cases", "below floor", "right", "in a set", "named instead or besides"),
