@@ -67,6 +67,29 @@ def test_a_tracked_place_counts_though_the_tracker_begins_late_and_misses_some(l
     assert np.abs(blind.pose - tracked).max() < 0.02
 
 
+def test_without_a_tracker_the_way_goes_on_from_the_piece_before(lively: Recording) -> None:
+    """Over a gap with the twist of its two ends, whether the piece before was tracked or not, and however it was turned."""
+    [motion] = read_motions(THESIS, lively, 0, 5.0, True)
+    [whole] = with_pose([motion], ModelNumbers.of(THESIS))
+    speed = np.linalg.norm(np.gradient(whole.pose, whole.time, axis=0)[:, :2], axis=1)
+    quarter = len(speed) // 4
+    at = quarter + int(np.argmax(np.where(np.abs(whole.pose[quarter:-quarter, 2]) > 0.5, speed[quarter:-quarter], 0.0)))
+    gap = round(0.1 / np.median(np.diff(whole.time)))
+    parts = [slice(0, at), slice(at + gap, None)]
+    pieces = [
+        dataclasses.replace(whole, **{
+            f.name: value[part] for f in dataclasses.fields(whole)
+            if isinstance(value := getattr(whole, f.name), np.ndarray) and len(value) == len(whole.time)
+        })
+        for part in parts
+    ]  # fmt: skip
+    pieces[1] = dataclasses.replace(pieces[1], pose=np.full_like(pieces[1].pose, np.nan))
+    found = with_pose(pieces, ModelNumbers.of(THESIS))
+    way = np.abs(whole.pose[at + gap] - whole.pose[at - 1]).max()
+    assert way > 0.02
+    assert np.abs(found[1].pose[0] - whole.pose[at + gap]).max() < 0.15 * way
+
+
 def test_channels_end_where_torques_tell_nothing_more(lively: Recording) -> None:
     widest = choose_cutoff(THESIS, [lively])
     assert widest > 5.0

@@ -89,7 +89,6 @@ def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[Rob
     begin at zero.
     """
     found: list[RobotMotion] = []
-    last_rate = np.zeros(3)
     for motion in motions:
         known = np.asarray(np.isfinite(motion.pose).all(axis=1), dtype=bool)
         if known.all():
@@ -98,16 +97,27 @@ def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[Rob
         twist = twists(numbers, numbers.headings(motion.position), motion.velocity)[0]
         if known.any():
             pose = _completed(motion.pose, known, twist, motion.time)
+        elif found and found[-1].recording == motion.recording:
+            pose = _rolled(_beyond(found[-1], numbers, twist[0], motion.time[0]), twist, motion.time)
         else:
-            start = np.zeros(3)
-            if found and found[-1].recording == motion.recording:
-                start = found[-1].pose[-1] + 0.5 * (last_rate + twist[0]) * (motion.time[0] - found[-1].time[-1])
-            pose = _rolled(start, twist, motion.time)
+            pose = _rolled(np.zeros(3), twist, motion.time)
         found.append(dataclasses.replace(motion, pose=pose))
-        vx, vy, omega = twist[-1]
-        c, s = np.cos(pose[-1, 2]), np.sin(pose[-1, 2])
-        last_rate = np.array([c * vx - s * vy, s * vx + c * vy, omega])
     return found
+
+
+def _beyond(before: RobotMotion, numbers: ModelNumbers, after: FloatArray, time: float) -> FloatArray:
+    """Pose (3,) at the end of the gap that follows a piece, of a twist (3,) at a time."""
+    last = twists(numbers, numbers.headings(before.position[-1:]), before.velocity[-1:])[0][0]
+    gap = time - before.time[-1]
+    yaws = before.pose[-1, 2] + np.array([0.0, 0.5 * (last[2] + after[2]) * gap])
+    ways = [0.5 * gap * _turned(twist, yaw) for twist, yaw in zip((last, after), yaws, strict=True)]
+    return np.asarray(before.pose[-1] + ways[0] + ways[1], dtype=np.float64)
+
+
+def _turned(twist: FloatArray, yaw: float) -> FloatArray:
+    """Twist (3,) along the axes of the world."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2]])
 
 
 def _completed(pose: FloatArray, known: BoolArray, twist: FloatArray, time: FloatArray) -> FloatArray:
