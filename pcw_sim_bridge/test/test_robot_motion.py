@@ -68,7 +68,7 @@ def test_a_tracked_place_counts_though_the_tracker_begins_late_and_misses_some(l
 
 
 def test_without_a_tracker_the_way_goes_on_from_the_piece_before(lively: Recording) -> None:
-    """Over a gap with the twist of its two ends, whether the piece before was tracked or not, and however it was turned."""
+    """Over a gap with the twist of its two ends: after a tracked piece, and though the robot has turned."""
     [motion] = read_motions(THESIS, lively, 0, 5.0, True)
     [whole] = with_pose([motion], ModelNumbers.of(THESIS))
     speed = np.linalg.norm(np.gradient(whole.pose, whole.time, axis=0)[:, :2], axis=1)

@@ -46,7 +46,8 @@ SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
 KEPT_PART = 0.02
 # A law that replaces a name must differ from it by this part of what the name does.
 REPLACED_PART = 0.15
-# A name whose law is changed has shown itself where it moves channels, in deviations of what is left, by this part of most.
+# What another function of a name's argument changes is held against the name only in channels where the name is clear: where
+# it moves them, in deviations of what is left there, by this part of what it does where it is clearest.
 CLEAR_PART = 0.5
 # So much smaller than all that was measured a law may be expected to be that stands for a name.
 SMALLER_PARTS = (0.3, 0.1, 0.03, 0.01)

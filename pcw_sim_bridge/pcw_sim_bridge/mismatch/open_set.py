@@ -228,7 +228,9 @@ def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> 
 
 
 def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tuple[EffectSearch, Selection, Law]:
-    """Put a law into the joint fit, in place of a name whose law it changes if the recording speaks against that name.
+    """Put a law into the joint fit, in place of a name whose law it changes where a closed form does without that name.
+
+    With fewer numbers it may do a little worse than both together, with as many it has to do better.
 
     Beside a viscous friction what is left of a drag by the square of the speed looks like one by its cube.
     """
