@@ -203,6 +203,19 @@ def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, ch
         assert off <= most * size, problem.channels[channel].name
 
 
+def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_does(tmp_path: Path) -> None:
+    """Its slips stayed those of the described tyres: friction by the angle of all steerings passed for a Coulomb friction."""
+    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 5)]).build()
+    [tyres] = [number for number in problem.nuisances if number.name == "contact.stiffness"]
+    softer = problem.exact_at({tyres.name: 0.4 * tyres.nominal}, ()).with_soft_tyres()
+    assert softer.sites is not None
+    [term] = [t for t in softer.terms if (t.effect, t.target) == ("drive_coulomb_friction", ("rear_left",))]
+    speed = softer.sites.variables["drive_velocity/rear_left"]
+    torque = np.zeros((len(speed), len(softer.sites.names), 1))
+    torque[:, softer.sites.names.index("drive_torque/rear_left"), 0] = -np.tanh(speed / softer.sites.smoothing)
+    assert softer.sites.columns(torque)[:, :, 0] == pytest.approx(term.columns(term.shapes[0])[:, :, 0], rel=1e-9, abs=1e-12)
+
+
 def test_scales_of_an_imu_are_numbers_too(tmp_path: Path) -> None:
     """Accelerometers half a percent off were parts of a gyroscope's error, with intervals as if nobody allowed them any."""
     problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 9)]).build()

@@ -9,7 +9,8 @@ A law counts if it beats the names, refined as far as they can be, by evidence a
 prediction by a part that matters. A name that it makes redundant is withdrawn, unless the name alone does most of what
 the law does: friction that varies by a tenth with the steering angle is friction and a leftover. If the best law does not
 count, every other one that could stand for a name is judged, too: beside a name a law must be large to be told of, in its
-place it is expected as small as the name is.
+place it is expected as small as the name is. So are plain functions of a name's own speed, each alone in its place: what a
+small drag leaves beside a viscous friction is too little to be found.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ import numpy as np
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
+from .leftover_expression import plain_forms
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
 from .regression_problem import FloatArray, RegressionProblem, Term
-from .unknown_law import Factor, Law, Place, combined, factor_values, hypotheses
+from .unknown_law import Combination, Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
 _Base = tuple[str, Factor]
@@ -118,7 +120,7 @@ class LawSearch:
 
     def run(self) -> FoundLaw | None:
         """Return the best law, whether it counts or not; None if no law looks better than nothing."""
-        trials = [self._trial(law) for law in self._screened()]
+        trials = [*(self._trial(law, self.names) for law in self._screened()), *self._in_place_of_names()]
         if not trials:
             return None
         # All are judged under the noise that the best of them leaves: under that of a worse one it is "slow noise".
@@ -178,13 +180,29 @@ class LawSearch:
 
     # -- finalists ----------------------------------------------------------------------------------------------
 
-    def _trial(self, law: Law) -> _Trial:
+    def _trial(self, law: Law, names: tuple[Instance, ...]) -> _Trial:
         term = law.term(self.problem)
         problem = self.problem.with_terms([term])
         settings = dataclasses.replace(self.search.settings, blocks=FOLDS * self.search.settings.blocks)
         search = EffectSearch(problem, self.search.rng, settings)
         everything = tuple(range(len(term.parameters)))
-        return _Trial(law, search, self.names, Instance(len(problem.terms) - 1, (), everything))
+        return _Trial(law, search, names, Instance(len(problem.terms) - 1, (), everything))
+
+    def _in_place_of_names(self) -> list[_Trial]:
+        """Plain functions of the joints' own speeds, each without the names of one effect that are functions of just these."""
+        assert self.problem.sites is not None
+        terms = {name: self.problem.terms[name.term] for name in self.names}
+        trials = []
+        for law in hypotheses(self.problem.sites) if terms else ():
+            if law.basis.kind != "speed" or any(p.factor != Factor() or p.arguments != _own_speed(p.site) for p in law.places):
+                continue
+            for effect in dict.fromkeys(term.effect for term in terms.values()):
+                own = {i: set(t.arguments) for i, t in terms.items() if t.effect == effect and t.arguments}
+                replaced = {i for i, arguments in own.items() if arguments <= set(law.depends_on)}
+                if replaced and set.union(*(own[i] for i in replaced)) == set(law.depends_on):
+                    others = tuple(name for name in self.names if name not in replaced)
+                    trials += [self._trial(plain, others) for plain in plain_forms(law)]
+        return trials
 
     def _left_by(self, trial: _Trial) -> FloatArray:
         return trial.search.residual_of(trial.instances)
@@ -297,6 +315,11 @@ class LawSearch:
             guessed = True
         # Slips are the model's guess, unless they do what no slow error of its torques and tyres does.
         return guessed and self.search.whiten_at(left).peculiar(change) > self.search.settings.least_peculiar
+
+
+def _own_speed(site: str) -> tuple[Combination, ...]:
+    """The speed of a site's own joint as the arguments of a law."""
+    return (((("velocity" if site == "axis_force" else site.replace("torque", "velocity")), 1.0),),)
 
 
 def _is_fast(law: Law) -> bool:

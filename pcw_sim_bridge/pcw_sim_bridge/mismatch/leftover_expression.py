@@ -107,6 +107,15 @@ def fourier(basis: Basis) -> ClosedForm:
     return ClosedForm("closed", basis.knots, basis.width, atoms=tuple(atoms), clipped=False)
 
 
+def plain_forms(law: Law) -> list[Law]:
+    """Return a law of one speed with each of the plain functions in place of its curve that no effect of the library is."""
+    basis = law.basis
+    return [
+        dataclasses.replace(law, basis=ClosedForm("closed", basis.knots, basis.width, atoms=(Atom(shape),), clipped=False))
+        for shape in (SQUARE, CUBE, DRAG)
+    ]
+
+
 def closed_form(basis: Basis, weights: FloatArray, covariance: FloatArray) -> ClosedForm | None:
     """Return the closed form that comes nearest to a curve of one argument with few numbers; None for maps of two.
 

@@ -260,6 +260,8 @@ def _adopted_beside(
 ) -> tuple[EffectSearch, Selection, Law]:
     """Put a law into the joint fit beside names: as a closed form if it does as well as the curve."""
     curve = _with_law(search, selection, found.law, names)
+    if isinstance(found.law.basis, ClosedForm):
+        return *curve, found.law
     weights, covariance = _weights_of(*curve, found.law)
     form = closed_form(found.law.basis, weights, covariance)
     if form is None:

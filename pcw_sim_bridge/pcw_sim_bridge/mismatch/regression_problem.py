@@ -459,7 +459,7 @@ class RegressionProblem:
         return moved
 
     def with_soft_tyres(self) -> RegressionProblem:
-        """Return the problem in which torques, of effects and of numbers, make tyres slip that are as soft as it is exact at.
+        """Return the problem in which torques, whatever they are of, make tyres slip that are as soft as it is exact at.
 
         How soft tyres are nobody knows to a third, and so little is it known in the columns of the description.
         """
@@ -478,7 +478,13 @@ class RegressionProblem:
             ) if term.is_exact and not term.is_curved else term
             for term in self.terms
         )  # fmt: skip
-        moved = dataclasses.replace(self, residual=residual, nuisances=tuple(nuisances), terms=terms)
+        sites = self.sites
+        if sites is not None:
+            sites = dataclasses.replace(sites, columns=_multiplied(sites.columns, factors[:, None]))
+        drifts = None if self.drifts is None else self.drifts * factors[:, None]
+        moved = dataclasses.replace(
+            self, residual=residual, nuisances=tuple(nuisances), terms=terms, sites=sites, drifts=drifts
+        )
         moved._remembered.update(self._without(*(k for k, term in enumerate(terms) if term is not self.terms[k])))
         return moved
 
