@@ -12,6 +12,7 @@ from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
+from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, sliding, used_friction
 from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
@@ -214,6 +215,37 @@ def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_doe
     torque = np.zeros((len(speed), len(softer.sites.names), 1))
     torque[:, softer.sites.names.index("drive_torque/rear_left"), 0] = -np.tanh(speed / softer.sites.smoothing)
     assert softer.sites.columns(torque)[:, :, 0] == pytest.approx(term.columns(term.shapes[0])[:, :, 0], rel=1e-9, abs=1e-12)
+
+
+def test_a_centre_of_mass_is_felt_as_a_moment_on_a_floor_that_leans(tmp_path: Path) -> None:
+    """Without it a payload's place was told from the chassis' centre of mass, with intervals that held neither."""
+    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 5)]).build()
+    [moment] = [k for k, channel in enumerate(problem.channels) if channel.name == "chassis_torque/z"]
+    angle, valid = 0.02, problem.valid[:, moment]
+
+    def column(slope: float) -> np.ndarray:
+        there = problem.exact_at({"ground.slope.x": slope, "chassis.com.x": 0.0}, ()).derived()
+        [number] = [number for number in there.nuisances if number.name == "chassis.com.x"]
+        return number.column[valid, moment]
+
+    pulled = THESIS.chassis.mass * 9.81 * angle * np.sin(problem.variables["yaw"][valid])
+    felt = column(angle) - column(1e-9)
+    assert min(np.linalg.norm(felt - pulled), np.linalg.norm(felt + pulled)) < 0.1 * np.linalg.norm(pulled)
+
+
+def test_shapes_go_by_the_slopes_of_the_model_to_where_it_costs_least(tmp_path: Path) -> None:
+    """A payload that a search left a decimetre too far out stayed there, and so was too light."""
+    payload = {"mass": 25.0, "x": -0.18, "y": 0.15}
+    loaded = dataclasses.replace(THESIS, physics=(EffectInstance("payload_mass", ("chassis",), payload | {"z": 0.5}),))
+    problem = RobotProblemBuilder(THESIS, [record(tmp_path, loaded, 5)]).build()
+    [term] = [k for k, t in enumerate(problem.terms) if t.effect == "payload_mass"]
+    shape = {**problem.terms[term].shapes[0], "x": payload["x"] - 0.08, "y": payload["y"] + 0.06}
+    search = EffectSearch(problem, np.random.default_rng(0))
+    found = search.polished(search.conclude([Instance(term, tuple(sorted(shape.items())), (0,))], 9.0))
+    [instance] = found.fit.instances
+    reached = dict(instance.shape)
+    assert abs(reached["x"] - payload["x"]) < 0.03 and abs(reached["y"] - payload["y"]) < 0.03
+    assert found.fit.mean[-1] == pytest.approx(payload["mass"], rel=0.1)
 
 
 def test_scales_of_an_imu_are_numbers_too(tmp_path: Path) -> None:

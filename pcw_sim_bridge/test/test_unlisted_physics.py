@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import json
 import subprocess
@@ -114,11 +115,11 @@ def quadratic(state: PlantState, motor: np.ndarray) -> np.ndarray:
     return torque
 
 
-def hard_spot(state: PlantState, motor: np.ndarray) -> np.ndarray:
+def hard_spot(state: PlantState, motor: np.ndarray, size: float = 0.5) -> np.ndarray:
     """Friction at one place of the turn of one wheel; named a row of coggings by who does not look."""
     torque = np.zeros((4, 2))
     from_spot = np.angle(np.exp(1j * (state.joint_position[2, 0] - 1.0)))
-    torque[2, 0] = -0.5 * np.exp(-0.5 * (from_spot / 0.3) ** 2) * np.tanh(state.joint_velocity[2, 0] / 0.05)
+    torque[2, 0] = -size * np.exp(-0.5 * (from_spot / 0.3) ** 2) * np.tanh(state.joint_velocity[2, 0] / 0.05)
     return torque
 
 
@@ -192,6 +193,14 @@ def test_one_place_of_a_turn_is_no_row_of_coggings(tmp_path, monkeypatch):
     [unknown] = findings.unknown
     assert unknown.depends_on == ("drive_angle/rear_left", "drive_velocity/rear_left")
     assert unknown.share_explained > 0.8
+
+
+def test_a_small_torque_is_told_where_nothing_is_named_and_the_model_errs_otherwise(tmp_path, monkeypatch):
+    """Less than a fiftieth of what is measured; nothing was said to be missing."""
+    small = functools.partial(hard_spot, size=0.03)
+    findings = analysed(record(tmp_path / "run", small, 3, monkeypatch)).findings
+    assert (findings.verdict, findings.effects) == ("unexplained", ())
+    assert findings.unknown[0].depends_on[0] == "drive_angle/rear_left"
 
 
 def test_what_changes_with_the_time_is_told_where_it_is_a_small_part_of_what_is_measured(tmp_path, monkeypatch):

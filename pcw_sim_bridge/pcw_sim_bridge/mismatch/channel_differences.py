@@ -68,7 +68,7 @@ class ChannelDifferences:
         pieces = []
         for motion, around, plain in zip(self.motions, self._around, self._sides, strict=True):
             measured, predicted = self.model.sides(motion, self.model.around_leaning(motion, around, change))
-            self.model.lean(motion, change, measured, predicted)
+            self.model.lean(motion, self.model.numbers, change, measured, predicted)
             pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
         return self.filtered(pieces)
 

@@ -23,7 +23,7 @@ import numpy as np
 from pcw_description.effects.registry import all_effects
 
 from .effect_gates import EffectGates
-from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY_EVIDENCE
+from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY, STEADY_EVIDENCE, STEPS
 from .gathered_terms import gatherings
 from .noise_model import SLOW_ORDINATES
 from .outline_search import Outlines, has_outline, reaching, searched_outline
@@ -31,6 +31,7 @@ from .regression_problem import HEALTHY, FloatArray, RegressionProblem, segment_
 from .selection_settings import SelectionSettings
 from .set_growth import GATHERED_AMONG, LadderStep, Progress, SetGrowth
 from .shape_search import DROP, refined_shape
+from .shape_slopes import sizes_of, slope_instances, with_slopes
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # Effects of so little less evidence [nats] are alike, and at most so many are tried; those of so much less are not looked at.
@@ -408,6 +409,51 @@ class EffectSearch(SetGrowth):
             return instead, gain
         self.problem, self._point = here
         return selection, 0.0
+
+    def polished(self, selection: Selection) -> Selection:
+        """The selection with the shapes that cost least where the problem is exact; those of patches have been searched so."""
+        for _ in range(EXACT_ROUNDS):
+            better = self._with_better_shapes(selection)
+            if better is None:
+                break
+            selection = better
+        return selection
+
+    def _with_better_shapes(self, selection: Selection) -> Selection | None:
+        """One step of numbers and shapes by their slopes; None where they are as good as they get."""
+        instances = selection.fit.instances
+        if not any(i.shape for i in instances) or not (self._is_exact_at(instances) or self._exact_at(selection.fit)):
+            return None
+        here, there, tangent = (self.problem, self._point), self._point_of(selection.fit), self.problem.tangent()
+        sloped, slopes = with_slopes(tangent, instances, sizes_of(instances, there), self.outlines)
+        if not slopes:
+            return None
+        fit = selection.regression.moved(sloped).fit((*instances, *slope_instances(sloped, slopes)))
+        steps, count = fit.mean[-len(slopes) :], len(there)
+        if np.all(np.abs(steps) < STEADY * np.sqrt(np.diag(fit.covariance)[-len(slopes) :])):
+            return None
+        least = self._cost_here(selection.regression, instances) - STEADY_EVIDENCE
+        for part in STEPS:
+            moved = list(instances)
+            for slope, step in zip(slopes, part * steps, strict=True):
+                moved[slope.index] = slope.moved(moved[slope.index], float(step))
+            aim = dataclasses.replace(selection.fit, instances=tuple(moved), mean=there + part * (fit.mean[:count] - there))
+            self.problem = tangent
+            if self._exact_at(aim) and self._cost_here(selection.regression, aim.instances) < least:
+                return self.conclude(aim.instances, selection.threshold)
+            self.problem, self._point = here
+        return None
+
+    def _is_exact_at(self, instances: tuple[Instance, ...]) -> bool:
+        """Whether the problem is exact with just these effects in these shapes."""
+        sizes = () if self.problem.point is None else self.problem.point.sizes
+        return {(i.term, i.shape) for i in instances} == {(size.term, size.shape) for size in sizes}
+
+    def _cost_here(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> float:
+        """Cost [nats] of numbers, sizes and shapes as they are where the problem is exact, under the noise of a regression."""
+        there = regression.moved(self.problem)
+        fit = there.fit(instances)
+        return there.cost(dataclasses.replace(fit, mean=self._point_of(fit)))
 
     def balanced(self, selection: Selection) -> Selection:
         """The selection with what an effect and a number of the description do alike shared out as their priors say.

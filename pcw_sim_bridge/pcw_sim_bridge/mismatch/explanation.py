@@ -43,6 +43,7 @@ from .regression_problem import (
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep, Progress
 from .shape_search import DROP, refined_shape, shape_interval
+from .shape_slopes import slope_instances, with_slopes
 from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
@@ -193,7 +194,7 @@ def explain(
             progress(f"not adopted: {suspect.describe()}")
     judgement = judge(search, selection, result)
     search, result = judgement.search, judgement.result
-    selection = search.balanced(_taking_over(search, judgement.selection))
+    selection = search.balanced(_taking_over(search, search.polished(judgement.selection)))
     problem = search.problem
     named = tuple(
         dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
@@ -537,10 +538,13 @@ def _estimates(problem: RegressionProblem, fit: Fit) -> list[FloatArray]:
 def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, ...]:
     """Numbers, intervals, probability and look-alikes of every effect of a selection."""
     problem, regression, fit = search.problem, selection.regression, selection.fit
-    tangent = problem.tangent()
-    there = regression if tangent is problem else regression.moved(tangent)
-    known = there.fit(fit.instances)
+    # How large an effect is and which shape it has are known together: a payload that is nearer may be heavier.
+    sloped, slopes = with_slopes(problem.tangent(), fit.instances, _estimates(problem, fit), search.outlines)
+    there = regression if sloped is problem else regression.moved(sloped)
+    known = there.fit((*fit.instances, *slope_instances(sloped, slopes)))
     misfit = there.misfit_covariance(known)
+    deviations = np.sqrt(np.maximum(np.diag(known.covariance), np.diag(misfit)))
+    beside_all = {(s.index, s.name): (s, float(d)) for s, d in zip(slopes, deviations[len(fit.mean) :], strict=True)}
     widening = np.maximum(np.diag(misfit) / np.maximum(np.diag(known.covariance), 1e-300), 1.0)
     numbers = [nuisance.name for nuisance in problem.nuisances]
     position = len(numbers)
@@ -566,6 +570,10 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
         wider = float(widening[position : position + active].max())
         for name, value in instance.shape:
             low, high = shape_interval(near, others, instance, name, wider)
+            if (index, name) in beside_all:
+                slope, deviation = beside_all[index, name]
+                first, last = slope.interval(instance, HALF_WIDTH * deviation)
+                low, high = min(low, first), max(high, last)
             estimates[name] = Estimate(value, "", low, high)
         if instance.term in search.outlines:
             estimates = _as_wide(estimates, term, instance, search.outlines[instance.term], DROP * wider)

@@ -252,7 +252,7 @@ class LawSearch:
         }
         replaced = [i not in trial.names and i not in idle for i in self.names]
         dropped = tuple(i for i, replace in zip(self.names, replaced, strict=True) if replace)
-        if dropped:
+        if dropped or not self.names:
             gain += gain_of_a_smaller_law(regression, trial.instances)
         sure = min(gain, held_out) >= (LAW_MARGIN if dropped else self.threshold)
         counts = sure and self._matters(problem, trial.law, with_law, without, replaced)
@@ -275,7 +275,8 @@ class LawSearch:
 
         Against a name that it replaces, or whose own law it changes, it is enough to differ by a fair part of what the name
         does. That something is there the name has shown; the model misjudges it by no more than it misjudges everything.
-        Details are the same at all times: what changes with the time may be a smaller part of what is measured.
+        Details are the same at all times: what changes with the time may be a smaller part of what is measured. So may a
+        torque at joints where nothing is named whose shape it could mend, if it is like no error of the model.
         """
         after = predicted(problem, with_law)
         change, left = after - predicted(problem, without), problem.residual - after
@@ -314,7 +315,9 @@ class LawSearch:
                 return True
             guessed = True
         # Slips are the model's guess, unless they do what no slow error of its torques and tyres does.
-        return guessed and self.search.whiten_at(left).peculiar(change) > self.search.settings.least_peculiar
+        settings, alone = self.search.settings, not self.names and not any(site.startswith("chassis") for site in law.sites)
+        least = settings.least_peculiar_unlike if alone else settings.least_peculiar
+        return (guessed or alone) and self.search.whiten_at(left).peculiar(change) > least
 
 
 def _own_speed(site: str) -> tuple[Combination, ...]:
@@ -368,7 +371,8 @@ def _held_out_error(regression: WhitenedRegression, instances: Sequence[Instance
 def gain_of_a_smaller_law(regression: WhitenedRegression, instances: Sequence[Instance]) -> float:
     """What it gains [nats] to expect the law, the last instance, to be smaller than all that was measured.
 
-    A law beside the names must be a surprise. One in place of a name is expected to be as small as the name is.
+    A law beside names must be a surprise. One in place of a name is expected to be as small as the name is, and one of which
+    nothing named holds a part as small as what is left.
     """
     gram, deviations = regression.grams(instances).sum(axis=0), regression.deviations(instances)
     own = len(instances[-1].active)

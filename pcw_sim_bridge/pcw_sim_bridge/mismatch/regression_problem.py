@@ -516,6 +516,28 @@ class RegressionProblem:
         moved._remembered.update(problem._remembered | found)
         return moved
 
+    def change_between(
+        self, size: SizedTerm, less: tuple[tuple[str, float], ...], more: tuple[tuple[str, float], ...]
+    ) -> FloatArray | None:
+        """What an effect does to the residual with the shape `more` beyond what it does with `less`, (T, C).
+
+        Of one that is not in proportion to its size it is the model's own, where the problem is exact; None where it has none.
+        """
+        places = [(other.term, other.shape) for other in (() if self.point is None else self.point.sizes)]
+        curved = self._holds(size) and self.terms[size.term].is_curved and (size.term, size.shape) in places
+        if self.exact is None or self.point is None or not curved:
+            first, last = (self.tried_columns(size.term, shape) @ size.coefficients for shape in (less, more))
+            return last - first
+        index, sizes = places.index((size.term, size.shape)), list(self.point.sizes)
+        left = []
+        for shape in (less, more):
+            there = [*sizes[:index], dataclasses.replace(sizes[index], shape=shape), *sizes[index + 1 :]]
+            found = self.exact(self.point.changes, self._held(there))
+            if found is None:
+                return None
+            left.append(found[0])
+        return left[0] - left[1]
+
     def _holds(self, size: SizedTerm) -> bool:
         """Whether the exact residual holds an effect; laws that came later are not in it."""
         return size.term < len(self.terms) and self.terms[size.term].is_exact

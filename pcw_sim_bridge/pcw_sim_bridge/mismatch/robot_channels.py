@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -159,7 +160,6 @@ class RobotProblemBuilder:
     ) -> tuple[FloatArray, Sequence[str]] | None:
         """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be."""
         varied = [n for n in varied_numbers(self.robot, differences) if n.label in changes]
-        lean = np.array([*(changes.get(name, 0.0) for name in FLOOR), 0.0])
         pieces = []
         for recording in dict.fromkeys(motion.recording for motion in self._read):
             # What happened in one recording alone was not at work in another.
@@ -168,10 +168,7 @@ class RobotProblemBuilder:
             if model is None:
                 return None
             for motion in self._motions_of(model, recording):
-                around = model.around_leaning(motion, model.around(motion), lean) if lean.any() else model.around(motion)
-                measured, predicted = model.sides(motion, around)
-                if lean.any():
-                    model.lean(motion, lean, measured, predicted)
+                measured, predicted = model.sides(motion, model.around(motion))
                 pieces.append(np.nan_to_num(measured - predicted))
         return differences.filtered(pieces), [*(n.label for n in varied), *(name for name in FLOOR if name in changes)]
 
@@ -206,7 +203,10 @@ class RobotProblemBuilder:
         sizes: Sequence[SizedTerm],
     ) -> ChannelModel | None:
         """The channel model with numbers changed and effects at work; None where they cannot be."""
-        instances = []
+        # On a floor that leans what is off in a centre of mass is felt as a moment, too.
+        east, north = (changes.get(name, 0.0) for name in FLOOR)
+        slope = {"angle": math.asin(math.hypot(east, north)), "direction": math.atan2(north, east)}
+        instances = [effect_instance("ground_slope", ("chassis",), slope, None)] if slope["angle"] else []
         for size in sizes:
             term = terms[size.term]
             if term.is_exact:

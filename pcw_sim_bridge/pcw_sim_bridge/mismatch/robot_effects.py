@@ -446,10 +446,11 @@ class ChannelModel:
 
     def sides(self, motion: RobotMotion, around: Surroundings, numbers: ModelNumbers | None = None) -> Sides:
         """Measured and predicted side of every channel along a true motion, (T, C) each."""
-        sides = channel_sides(motion, numbers or self.numbers, self.layout, around)
+        numbers = numbers or self.numbers
+        sides = channel_sides(motion, numbers, self.layout, around)
         for instance in self.robot.physics:
             if not isinstance(effect := get(instance.name), ClockEffect):  # a true motion has the right times
-                self._apply(motion, effect, instance.parameters, *sides)
+                self._apply(motion, numbers, effect, instance.parameters, *sides)
         return sides
 
     def sides_with(self, motion: RobotMotion, around: Surroundings, plain: Sides, instance: EffectInstance) -> Sides:
@@ -473,19 +474,20 @@ class ChannelModel:
             sides = self.sides(motion, self.around_with(motion, around, instance))
         else:
             sides = plain[0].copy(), plain[1].copy()
-        self._apply(motion, effect, instance.parameters, *sides)
+        self._apply(motion, self.numbers, effect, instance.parameters, *sides)
         return sides
 
     def _apply(
-        self, motion: RobotMotion, effect: Effect, values: Mapping[str, float], measured: FloatArray, predicted: FloatArray
+        self, motion: RobotMotion, numbers: ModelNumbers, effect: Effect, values: Mapping[str, float], measured: FloatArray,
+        predicted: FloatArray,
     ) -> None:
         """Change both sides as an effect on forces, gravity, IMU or clocks does; other kinds change nothing here."""
         layout = self.layout
         if isinstance(effect, ChassisForceEffect) and layout.balanced:
-            wrench = effect.contribution(_between_samples(self._at(motion)), values)
+            wrench = effect.contribution(_between_samples(_at(motion, numbers)), values)
             measured[:, :3] += wrench[:, [0, 1, 5]].reshape(-1, BETWEEN_SAMPLES, 3).mean(axis=1)
         elif isinstance(effect, GravityEffect):
-            self.lean(motion, effect.gravity(values), measured, predicted)
+            self.lean(motion, numbers, effect.gravity(values), measured, predicted)
         elif isinstance(effect, ImuEffect) and layout.imu:
             sensed = predicted[:, layout.inertial]
             zero = np.zeros(len(sensed))
@@ -502,40 +504,45 @@ class ChannelModel:
                 offset = effect.offset("ground_truth/odom", values)
                 measured[:, layout.tracked] += offset * derivative(motion.tracked_twist, motion.rate)
 
-    def _mass_and_centre(self) -> tuple[float, FloatArray]:
-        """Mass of the whole robot [kg] and its centre (3,) [m], the casters' modules at their axes."""
-        chassis, modules = self.robot.chassis, self.numbers.modules
-        mass = chassis.mass + float(modules[:, 0].sum())
-        moment = chassis.mass * np.array(chassis.com)
-        moment[:2] += modules[:, 0] @ self.numbers.steer_axis
-        moment[2] += float(modules[:, 0] @ self.numbers.radius)
-        return mass, moment / mass
-
-    def _at(self, motion: RobotMotion) -> FloatArray:
-        at = np.zeros((len(motion.time), FORCE_INPUTS))
-        at[:, FORCE_TIME] = motion.time
-        at[:, POSE_X : POSE_YAW + 1] = motion.pose
-        at[:, TWIST_X : TWIST_YAW + 1] = twists(self.numbers, self.numbers.headings(motion.position), motion.velocity)[0]
-        at[:, [COM_X, COM_Y, COM_Z]] = self._mass_and_centre()[1]
-        return at
-
     def _pull(self, motion: RobotMotion, change: FloatArray) -> FloatArray:
         """What gravity pulls along base_link's axes (T, 2) [m/s^2] when it leans by `change` (3,) in those of the yaw."""
         pull = GRAVITY * change
         c, s = np.cos(motion.pose[:, 2]), np.sin(motion.pose[:, 2])
         return np.column_stack([c * pull[0] + s * pull[1], c * pull[1] - s * pull[0]])
 
-    def lean(self, motion: RobotMotion, change: FloatArray, measured: FloatArray, predicted: FloatArray) -> None:
+    def lean(
+        self, motion: RobotMotion, numbers: ModelNumbers, change: FloatArray, measured: FloatArray, predicted: FloatArray
+    ) -> None:
         """Change both sides as gravity does whose unit vector leans by `change` (3,), in axes of the yaw.
 
         What it changes of the forces under the wheels is that of the surroundings' `pull`.
         """
         along, across = self._pull(motion, change).T
         if self.layout.balanced:
-            mass, centre = self._mass_and_centre()
+            mass, centre = _mass_and_centre(numbers)
             measured[:, 0] += mass * along
             measured[:, 1] += mass * across
             measured[:, 2] += mass * (centre[0] * across - centre[1] * along)
         if self.layout.imu:
             predicted[:, self.layout.inertial.start + 1] -= along
             predicted[:, self.layout.inertial.start + 2] -= across
+
+
+def _mass_and_centre(numbers: ModelNumbers) -> tuple[float, FloatArray]:
+    """Mass of the whole robot [kg] and its centre (3,) [m], the casters' modules at their axes."""
+    modules = numbers.modules[:, 0]
+    mass = float(numbers.chassis[0]) + float(modules.sum())
+    moment = numbers.chassis[0] * np.array([numbers.chassis[1], numbers.chassis[2], numbers.com_height])
+    moment[:2] += modules @ numbers.steer_axis
+    moment[2] += float(modules @ numbers.radius)
+    return mass, moment / mass
+
+
+def _at(motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:
+    """What forces on the chassis are functions of, along a motion (T, FORCE_INPUTS)."""
+    at = np.zeros((len(motion.time), FORCE_INPUTS))
+    at[:, FORCE_TIME] = motion.time
+    at[:, POSE_X : POSE_YAW + 1] = motion.pose
+    at[:, TWIST_X : TWIST_YAW + 1] = twists(numbers, numbers.headings(motion.position), motion.velocity)[0]
+    at[:, [COM_X, COM_Y, COM_Z]] = _mass_and_centre(numbers)[1]
+    return at
