@@ -205,7 +205,7 @@ class RobotProblemBuilder:
         """The channel model with numbers changed and effects at work; None where they cannot be."""
         # On a floor that leans what is off in a centre of mass is felt as a moment, too.
         east, north = (changes.get(name, 0.0) for name in FLOOR)
-        slope = {"angle": math.asin(math.hypot(east, north)), "direction": math.atan2(north, east)}
+        slope = {"angle": math.asin(min(math.hypot(east, north), 1.0)), "direction": math.atan2(north, east)}
         instances = [effect_instance("ground_slope", ("chassis",), slope, None)] if slope["angle"] else []
         for size in sizes:
             term = terms[size.term]
