@@ -447,7 +447,7 @@ class EffectSearch(SetGrowth):
     def _is_exact_at(self, instances: tuple[Instance, ...]) -> bool:
         """Whether the problem is exact with just these effects in these shapes."""
         sizes = () if self.problem.point is None else self.problem.point.sizes
-        return {(i.term, i.shape) for i in instances} == {(size.term, size.shape) for size in sizes}
+        return {(i.term, i.shape, i.active) for i in instances} == {(s.term, s.shape, s.active) for s in sizes}
 
     def _cost_here(self, regression: WhitenedRegression, instances: tuple[Instance, ...]) -> float:
         """Cost [nats] of numbers, sizes and shapes as they are where the problem is exact, under the noise of a regression."""

@@ -543,7 +543,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
     there = regression if sloped is problem else regression.moved(sloped)
     known = there.fit((*fit.instances, *slope_instances(sloped, slopes)))
     misfit = there.misfit_covariance(known)
-    deviations = np.sqrt(np.maximum(np.diag(known.covariance), np.diag(misfit)))
+    deviations = np.sqrt(np.diag(known.covariance))
     beside_all = {(s.index, s.name): (s, float(d)) for s, d in zip(slopes, deviations[len(fit.mean) :], strict=True)}
     widening = np.maximum(np.diag(misfit) / np.maximum(np.diag(known.covariance), 1e-300), 1.0)
     numbers = [nuisance.name for nuisance in problem.nuisances]

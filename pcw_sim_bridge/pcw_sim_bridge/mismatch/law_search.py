@@ -27,7 +27,7 @@ from .evidence_selection import EffectSearch, Selection
 from .leftover_expression import plain_forms
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
-from .regression_problem import FloatArray, RegressionProblem, Term
+from .regression_problem import UNKNOWN, FloatArray, RegressionProblem, Term
 from .unknown_law import Combination, Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -192,6 +192,7 @@ class LawSearch:
         """Plain functions of the joints' own speeds, each without the names of one effect that are functions of just these."""
         assert self.problem.sites is not None
         terms = {name: self.problem.terms[name.term] for name in self.names}
+        terms = {name: term for name, term in terms.items() if term.effect != UNKNOWN}
         trials = []
         for law in hypotheses(self.problem.sites) if terms else ():
             if law.basis.kind != "speed" or any(p.factor != Factor() or p.arguments != _own_speed(p.site) for p in law.places):

@@ -326,13 +326,21 @@ def _without_what_names_hold(search: EffectSearch, selection: Selection, law: La
 def _with_law(
     search: EffectSearch, selection: Selection, law: Law, names: tuple[Instance, ...]
 ) -> tuple[EffectSearch, Selection]:
-    """Fit names and law jointly."""
-    problem = search.problem.with_terms([law.term(search.problem)])
-    wider = EffectSearch(problem, search.rng, search.settings, search.progress)
-    wider.noise_gain, wider.ladder = search.noise_gain, search.ladder
-    wider.where_exact, wider.outlines = search.where_exact, search.outlines
-    instance = Instance(len(problem.terms) - 1, (), tuple(range(len(problem.terms[-1].parameters))))
-    return wider, wider.conclude((*names, instance), selection.threshold)
+    """Fit names and law jointly, the law on tyres that are as soft as they come out beside it."""
+    problem = search.problem
+    for _ in range(2):
+        wider = EffectSearch(problem.with_terms([law.term(problem)]), search.rng, search.settings, search.progress)
+        wider.noise_gain, wider.ladder = search.noise_gain, search.ladder
+        wider.where_exact, wider.outlines = search.where_exact, search.outlines
+        terms = wider.problem.terms
+        instance = Instance(len(terms) - 1, (), tuple(range(len(terms[-1].parameters))))
+        selection_with = wider.conclude((*names, instance), selection.threshold)
+        changes = {n.name: float(mean) for n, mean in zip(problem.nuisances, selection_with.fit.mean, strict=False)}
+        again = problem.with_laws_at(changes)
+        if again is problem:
+            break
+        problem = again
+    return wider, selection_with
 
 
 def _without_redundant(search: EffectSearch, selection: Selection) -> Selection:

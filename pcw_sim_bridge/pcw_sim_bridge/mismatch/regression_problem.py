@@ -287,6 +287,7 @@ class RegressionProblem:
         derive: (changes, sizes) -> columns of nuisances there, by name; None where `exact` is.
         softened: changes -> factors (C,) on what torques do to each channel where the tyres are as soft as these changes make
             them, and names of the nuisances that are torques; None where nothing rolls.
+        soft: the factors (C,) that torques have now; None: those of the description.
         nominal: residual of the description as it is, where `residual` is exact elsewhere; point: where.
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
@@ -312,6 +313,7 @@ class RegressionProblem:
     exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
     derive: Callable[[Mapping[str, float], Sequence[SizedTerm]], Mapping[str, FloatArray] | None] | None = None
     softened: Callable[[Mapping[str, float]], tuple[FloatArray, Sequence[str]]] | None = None
+    soft: FloatArray | None = None
     nominal: FloatArray | None = None
     point: Point | None = None
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
@@ -483,9 +485,22 @@ class RegressionProblem:
             sites = dataclasses.replace(sites, columns=_multiplied(sites.columns, factors[:, None]))
         drifts = None if self.drifts is None else self.drifts * factors[:, None]
         moved = dataclasses.replace(
-            self, residual=residual, nuisances=tuple(nuisances), terms=terms, sites=sites, drifts=drifts
+            self, residual=residual, nuisances=tuple(nuisances), terms=terms, sites=sites, drifts=drifts, soft=factors
         )
         moved._remembered.update(self._without(*(k for k, term in enumerate(terms) if term is not self.terms[k])))
+        return moved
+
+    def with_laws_at(self, changes: Mapping[str, float]) -> RegressionProblem:
+        """Return the problem in which new laws make tyres slip that are as soft as these changes make them.
+
+        Without a large law the tyres come out too soft for its sake.
+        """
+        if self.softened is None or self.soft is None or self.sites is None:
+            return self
+        factors, _ = self.softened(changes)
+        sites = dataclasses.replace(self.sites, columns=_multiplied(self.sites.columns, (factors / self.soft)[:, None]))
+        moved = dataclasses.replace(self, sites=sites, soft=factors)
+        moved._remembered.update(self._remembered)
         return moved
 
     def tangent(self) -> RegressionProblem:
