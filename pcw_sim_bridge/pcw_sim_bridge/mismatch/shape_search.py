@@ -5,7 +5,8 @@
 
 Each parameter is searched on the scale of its grid, linear or logarithmic, one after the other: first between the
 neighbours on the grid, since there may be two maxima, then by parabolas through the best point and those beside it. An
-interval is that of the profile likelihood: all else is fitted again at each value.
+interval is that of the profile likelihood: all numbers are fitted again at each value, the other shapes stay. With slopes
+(`shape_slopes`) these move too; the wider of both is told.
 """
 
 from __future__ import annotations
