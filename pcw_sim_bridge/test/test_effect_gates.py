@@ -43,19 +43,18 @@ def test_gears_of_all_casters_stand_out_from_what_a_chassis_does_to_all_wheels(n
 @pytest.mark.parametrize(
     ("term", "passes"),
     [
-        ({"is_exact": True}, True),
-        ({"is_exact": True, "is_curved": True}, False),
-        ({"is_exact": False}, False),
-        ({"is_exact": True, "effect": UNKNOWN}, False),
-        ({"is_exact": True, "is_curved": True, "unlike_errors": True}, True),
-        ({"is_exact": True, "is_curved": True, "unlike_errors": True, "noisy": True}, False),
+        ({"at_joints": True}, True),
+        ({"is_exact": True}, False),
+        ({"effect": UNKNOWN}, False),
+        ({"unlike_errors": True}, True),
+        ({"unlike_errors": True, "noisy": True}, False),
     ],
 )
 def test_what_has_a_shape_of_its_own_needs_less_to_be_told_from_errors(term: dict[str, object], passes: bool) -> None:
     """Smaller than what the model misjudges, and of a shape that its errors have not: torques at joints, errors of reading
     that turn with a joint, play. An encoder off its centre was silent with 95 nats, and so was play in all steerings with 435.
     """
-    term = {"effect": "friction", "target": ("a",), "noisy": False, "is_curved": False, "unlike_errors": False, **term}
+    term = {"effect": "friction", "target": ("a",), "noisy": False, "at_joints": False, "unlike_errors": False, **term}
     settings = SelectionSettings()
     problem = SimpleNamespace(
         terms=[SimpleNamespace(**term)], scale_deviation=0.0, measured=np.ones((2, 1)), valid=np.ones((2, 1), dtype=bool),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .noise_model import channel_deviations
-from .regression_problem import UNKNOWN, BoolArray, FloatArray, RegressionProblem
+from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -169,8 +169,7 @@ class EffectGates:
 
     def _at_joints(self, instance: Instance) -> bool:
         """Whether an effect of the library adds torques to joints, in proportion to its numbers."""
-        term = self.problem.terms[instance.term]
-        return term.is_exact and not term.is_curved and term.effect != UNKNOWN
+        return self.problem.terms[instance.term].at_joints
 
     def _least(self, instance: Instance) -> float:
         """Part of what remains in some channel that a term must do at least.

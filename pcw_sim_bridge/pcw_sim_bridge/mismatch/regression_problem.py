@@ -158,6 +158,7 @@ class Term:
         log_prior: of the effect (see there), part of every evidence.
         whole: shaping parameters that are whole numbers unless the recording says otherwise (periods per turn).
         is_exact: the problem's exact residual holds it; is_curved: and it is not in proportion to its parameters.
+        at_joints: it adds torques to joints, in proportion to its parameters.
         turning: a phase or a direction shapes it, of which two a quarter turn apart make all others.
         noisy: its columns hold some of the noise that the residual holds, by the control that acts on that noise.
         unlike_errors: it turns with the angle of its own joint, or changes sides with the torque of its gear, as nothing does
@@ -183,6 +184,7 @@ class Term:
     whole: tuple[str, ...] = ()
     is_exact: bool = False
     is_curved: bool = False
+    at_joints: bool = False
     turning: bool = False
     noisy: bool = False
     unlike_errors: bool = False
@@ -477,7 +479,7 @@ class RegressionProblem:
             dataclasses.replace(
                 term, columns=_multiplied(term.columns, factors[:, None]),
                 scan=None if term.scan is None else _multiplied(term.scan, factors[:, None, None]),
-            ) if term.is_exact and not term.is_curved else term
+            ) if term.at_joints else term
             for term in self.terms
         )  # fmt: skip
         sites = self.sites

@@ -23,11 +23,12 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER,
 from ..plants.true_robot import as_it_really_is
 from .all_cores import on_all_cores
 from .channel_differences import ChannelDifferences
+from .clock_leads import clock_leads
 from .errors import MismatchError
 from .first_look import Looked, remainder
 from .found_effect import effect_instance
 from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, SizedTerm, Term
-from .robot_effects import ChannelModel, true_motion, with_pose
+from .robot_effects import ChannelModel, true_motion, with_leads, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, has_balance, read_motions
 from .robot_nuisances import (
     FLOOR,
@@ -60,6 +61,7 @@ DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_latera
 # Part of a tolerance over which a number's column is taken anew: by a wider one's curvature an effect on it would be told
 # from the number itself, which is the same thing.
 TANGENT_STEP = 0.01
+CLOCKS, CLOCK_NUMBERS = "clock_offset", ("offset", "tracker_offset")
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
 
@@ -97,6 +99,8 @@ class RobotProblemBuilder:
         self._read = motions
         self.model = ChannelModel(described, self.numbers, self.layout)
         self.motions = self._motions_of(self.model)
+        # Where a clock is far off columns are taken as if it were known. A running robot has no time for that.
+        self._leads = np.zeros(2) if live else clock_leads(self.motions, self.numbers)
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -114,11 +118,14 @@ class RobotProblemBuilder:
         Args:
             with_terms: False leaves out candidate effects: residual and tolerances alone are many times cheaper.
         """
+        leads = self._leads if with_terms else np.zeros(2)
+        if leads.any():
+            self.motions = self._motions_of(self.model, leads=leads)
         differences = ChannelDifferences(self.model, self.motions, self.filters)
         valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
         if with_terms and self.layout.balanced:
             self._read = with_balanced_torques(self._read, differences, valid, nuisances)
-            self.motions = self._motions_of(self.model)
+            self.motions = self._motions_of(self.model, leads=leads)
             differences = ChannelDifferences(self.model, self.motions, self.filters)
             nuisances = tuple(robot_nuisances(self.robot, differences))
         along = self._along_motions(differences)
@@ -132,7 +139,11 @@ class RobotProblemBuilder:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
             looked = Looked(left, deviation, valid, time, recording, rate, angle, *self._wheels())
-            terms = tuple(robot_terms(self.robot, differences, looked))
+            terms = tuple(robot_terms(self.robot, differences, looked, bool(leads.any())))
+        exact = functools.partial(self._exact, differences, terms, leads)
+        residual, nominal = differences.residual, None
+        if leads.any() and (found := exact({}, ())):
+            residual, nominal = found[0], ChannelDifferences(self.model, self._motions_of(self.model), self.filters).residual
         return RegressionProblem(
             channels=self.channels(),
             time=time,
@@ -140,7 +151,8 @@ class RobotProblemBuilder:
             recording=recording,
             rate=rate,
             measured=differences.measured,
-            residual=differences.residual,
+            residual=residual,
+            nominal=nominal,
             valid=valid,
             nuisances=nuisances,
             terms=terms,
@@ -149,31 +161,47 @@ class RobotProblemBuilder:
             scale_deviation=self._scale_deviation(),
             drifts=_drifts(terms) if self.layout.balanced else None,
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
-            exact=functools.partial(self._exact, differences, terms),
-            derive=functools.partial(self._derive, differences, terms),
+            exact=exact,
+            derive=functools.partial(self._derive, differences, terms, leads),
             softened=self._softened if self.layout.balanced else None,
             remarks=self._remarks(),
         )
 
     def _exact(
-        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
+        self,
+        differences: ChannelDifferences,
+        terms: Sequence[Term],
+        leads: FloatArray,
+        changes: Mapping[str, float],
+        sizes: Sequence[SizedTerm],
     ) -> tuple[FloatArray, Sequence[str]] | None:
-        """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be."""
+        """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be.
+
+        Where clocks are ahead and no effect says so it is what the first order that is taken there makes of that.
+        """
         varied = [n for n in varied_numbers(self.robot, differences) if n.label in changes]
-        pieces = []
+        pieces, unsaid = [], _unsaid(leads, terms, sizes)
         for recording in dict.fromkeys(motion.recording for motion in self._read):
             # What happened in one recording alone was not at work in another.
             own = [size for size in sizes if terms[size.term].recording in (None, recording)]
             model = self._model_at(varied, terms, changes, own)
             if model is None:
                 return None
-            for motion in self._motions_of(model, recording):
+            for motion in self._motions_of(model, recording, unsaid):
                 measured, predicted = model.sides(motion, model.around(motion))
                 pieces.append(np.nan_to_num(measured - predicted))
-        return differences.filtered(pieces), [*(n.label for n in varied), *(name for name in FLOOR if name in changes)]
+        residual = differences.filtered(pieces)
+        if unsaid.any():
+            residual += differences.of_effect(effect_instance(CLOCKS, ("clock",), dict(zip(CLOCK_NUMBERS, unsaid)), None))
+        return residual, [*(n.label for n in varied), *(name for name in FLOOR if name in changes)]
 
     def _derive(
-        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
+        self,
+        differences: ChannelDifferences,
+        terms: Sequence[Term],
+        leads: FloatArray,
+        changes: Mapping[str, float],
+        sizes: Sequence[SizedTerm],
     ) -> Mapping[str, FloatArray] | None:
         """Columns (T, C) of the numbers where they are changed so and effects are at work; None where they cannot be."""
         varied = varied_numbers(self.robot, differences)
@@ -181,7 +209,8 @@ class RobotProblemBuilder:
         model = self._model_at([n for n in varied if n.label in changes], terms, changes, lasting)
         if model is None:
             return None
-        there = ChannelDifferences(model, self._motions_of(model), self.filters)
+        motions = self._motions_of(model, leads=_unsaid(leads, terms, lasting))
+        there = ChannelDifferences(model, motions, self.filters)
         columns = on_all_cores(lambda n: there.of_numbers(n.vary, TANGENT_STEP * n.deviation), varied)
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
         return found | {nuisance.name: nuisance.column for nuisance in floor_nuisances(self.robot, there)}
@@ -221,10 +250,14 @@ class RobotProblemBuilder:
             number.vary(numbers, changes[number.label])
         return ChannelModel(described, numbers, self.layout)
 
-    def _motions_of(self, model: ChannelModel, recording: int | None = None) -> list[RobotMotion]:
-        """What was read in one recording, or in all, as the joints of a model moved."""
-        read = [motion for motion in self._read if recording in (None, motion.recording)]
-        return with_pose([true_motion(model.robot, motion) for motion in read], model.numbers)
+    def _motions_of(
+        self, model: ChannelModel, recording: int | None = None, leads: FloatArray | None = None
+    ) -> list[RobotMotion]:
+        """What was read in one recording, or in all, as the joints of a model moved, with clocks ahead (2,) [s] put right."""
+        motions = [true_motion(model.robot, motion) for motion in self._read if recording in (None, motion.recording)]
+        if leads is not None and leads.any():
+            motions = [with_leads(motion, *leads) for motion in motions]
+        return with_pose(motions, model.numbers)
 
     def _wheels(self) -> tuple[FloatArray, FloatArray]:
         """Places (T, n, 2) [m] and headings (T, n) [rad] of the wheels in the world."""
@@ -326,6 +359,12 @@ class RobotProblemBuilder:
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
         return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+
+
+def _unsaid(leads: FloatArray, terms: Sequence[Term], sizes: Sequence[SizedTerm]) -> FloatArray:
+    """Return by how much clocks are ahead (2,) [s] that no effect at work is about."""
+    said = any(terms[size.term].effect == CLOCKS for size in sizes)
+    return np.zeros(2) if said else leads
 
 
 def allowed_slip(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:

@@ -245,13 +245,18 @@ def true_motion(robot: RobotDescription, motion: RobotMotion) -> RobotMotion:
             motion = with_true_angles(robot, motion, effect, instance.target, instance.parameters, instance.axis)
         elif isinstance(effect, ClockEffect):
             inertial, tracked = (effect.offset(topic, instance.parameters) for topic in ("imu/data", "ground_truth/odom"))
-            motion = dataclasses.replace(
-                motion,
-                imu=_later(motion, motion.imu, inertial),
-                pose=_later(motion, motion.pose, tracked),
-                tracked_twist=_later(motion, motion.tracked_twist, tracked),
-            )
+            motion = with_leads(motion, inertial, tracked)
     return motion
+
+
+def with_leads(motion: RobotMotion, inertial: float, tracked: float) -> RobotMotion:
+    """Return the motion with what IMU and tracker sensed in its time, where their stamps are ahead by so much [s]."""
+    return dataclasses.replace(
+        motion,
+        imu=_later(motion, motion.imu, inertial),
+        pose=_later(motion, motion.pose, tracked),
+        tracked_twist=_later(motion, motion.tracked_twist, tracked),
+    )
 
 
 def _later(motion: RobotMotion, values: FloatArray, offset: float) -> FloatArray:

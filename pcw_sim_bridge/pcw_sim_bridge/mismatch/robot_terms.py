@@ -48,16 +48,27 @@ VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
 _ARGUMENT_NAMES = {"position": "angle", "velocity": "velocity", "force": "torque", "normal_force": "normal_force"}
 
 
-def robot_terms(robot: RobotDescription, differences: ChannelDifferences, looked: Looked) -> list[Term]:
-    """Return all candidates whose effects show in the channels; `looked` is what a first look needs."""
-    return _TermMaker(robot, differences, looked).terms()
+def robot_terms(
+    robot: RobotDescription, differences: ChannelDifferences, looked: Looked, exact_clocks: bool = False
+) -> list[Term]:
+    """Return all candidates whose effects show in the channels.
+
+    Args:
+        robot: the nominal robot.
+        differences: what its channels differ by.
+        looked: what a first look needs.
+        exact_clocks: the problem's exact residual holds what clocks are off by.
+    """
+    return _TermMaker(robot, differences, looked, exact_clocks).terms()
 
 
 class _TermMaker:
     """Makes the candidates of one problem."""
 
-    def __init__(self, robot: RobotDescription, differences: ChannelDifferences, looked: Looked) -> None:
-        self.robot, self.differences, self.looked = robot, differences, looked
+    def __init__(
+        self, robot: RobotDescription, differences: ChannelDifferences, looked: Looked, exact_clocks: bool
+    ) -> None:
+        self.robot, self.differences, self.looked, self.exact_clocks = robot, differences, looked, exact_clocks
         self.layout = differences.model.layout
         self._of_joint: dict[tuple[int, int], Chosen] = {}
 
@@ -134,6 +145,7 @@ class _TermMaker:
             repeatable=among > 0,
             grid_size=among,
             is_exact=True,
+            at_joints=True,
             noisy="force" in kernel_arguments(effect.name),
             headed=headed if orders and (axis or effect.axis) == "steer" else None,
         )
@@ -257,9 +269,9 @@ class _TermMaker:
             parameters=tuple(
                 _linear(p, neutral[p.name], room) for p, room in zip(shown, self._room(everything[:, :, seen]), strict=True)
             ),
-            # A shift of noisy samples is no column: see `ClockEffect` in robot_effects.
-            is_exact=not isinstance(effect, ClockEffect),
-            is_curved=True,
+            # A shift of noisy samples is no column: see `ClockEffect` in robot_effects. A secant would be one.
+            is_exact=not isinstance(effect, ClockEffect) or self.exact_clocks,
+            is_curved=not (isinstance(effect, ClockEffect) and self.exact_clocks),
             resolution=chosen.resolution,
             grid_size=chosen.among,
             turning=turning is not None,
