@@ -231,6 +231,17 @@ def test_samples_that_are_not_judged_do_not_say_how_fast_a_joint_turns() -> None
     assert np.abs(chosen.values - 5.0).min() < math.pi / np.ptp(angle)
 
 
+@pytest.mark.parametrize(("span", "order", "seen"), [(3.2, 14.0, True), (1.6, 24.0, True), (3.2, 4.0, False)])
+def test_a_ripple_is_known_by_its_waves_where_a_joint_turns_by_less_than_a_turn(span: float, order: float, seen: bool) -> None:
+    """Steerings that swing to and fro: 14 a turn with 10000 nats had no name, as none of them had made a whole turn."""
+    time = np.arange(1200) / 20.0
+    angle = 0.5 * span * np.sin(0.4 * time)
+    signal = np.cos(order * angle + 0.7) + 0.5 * np.random.default_rng(1).standard_normal(len(angle))
+    chosen = orders(signal, angle, 20.0)
+    assert (np.abs(chosen.values - order).min() < math.pi / np.ptp(angle)) == seen
+    assert chosen.values.min() >= 3.0 * math.tau / np.ptp(angle)
+
+
 def test_a_joint_that_hardly_turns_has_no_orders() -> None:
     angle = np.linspace(0.0, 1.0, 500)
     assert len(orders(np.sin(30.0 * angle), angle, 20.0).values) == 0

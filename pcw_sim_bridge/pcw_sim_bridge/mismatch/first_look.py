@@ -25,6 +25,8 @@ MOST_ORDERS = 4
 # A ripple may show in this part of the samples alone, those in which the joint turns slowly.
 SLOW_PART = 0.1
 SAMPLES_PER_WAVE = 8.0
+# Of a joint that turns by so much [rad], and by no whole turn, ripples are known by so many of their waves.
+LEAST_TURN, LEAST_WAVES = 1.5, 3.0
 # Pushes last so long [s]; patches of floor measure so much [m], on a grid of such cells.
 LONGEST_PUSH, SHORTEST_PUSH = 12.0, 0.4
 PATCHES = (0.12, 0.18, 0.27, 0.4, 0.6, 0.9)
@@ -111,8 +113,9 @@ def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
     span = float(np.ptp(angle))
     moved = np.abs(np.diff(angle))[signal[1:] != 0.0]
     speed = float(np.quantile(moved, SLOW_PART)) * rate if len(moved) else 0.0
-    if span < math.tau:
+    if span < LEAST_TURN:
         return Chosen(np.zeros(0), 1)
+    least = 0.5 if span >= math.tau else LEAST_WAVES * math.tau / span
     largest = min(math.pi * rate / max(speed, 1e-9), LARGEST_ORDER)
     # A signal over evenly spaced angles has its orders by one transform; each sample is shared by the two next to it.
     density = SAMPLES_PER_WAVE * largest / math.tau
@@ -123,7 +126,7 @@ def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
     along = np.bincount(before, (1.0 - part) * signal, count) + np.bincount(before + 1, part * signal, count)
     power = np.abs(np.fft.rfft(along, 4 * count)) ** 2
     tried = math.tau * density / (4 * count) * np.arange(len(power))
-    wanted = (tried >= max(tried[1], 0.5)) & (tried < largest)
+    wanted = (tried >= max(tried[1], least)) & (tried < largest)
     tried, power = tried[wanted], power[wanted]
     if not len(tried):
         return Chosen(np.zeros(0), 1)

@@ -150,9 +150,12 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
         kept = [other for other in selection.fit.instances if other != instance]
         selection = search.conclude(kept, selection.threshold)
         result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
+    # A second law, or an effect in its place, may do without the first one, and with the names that it had made redundant.
+    named = {search.label(instance) for instance in selection.fit.instances}
+    withdrawn = [(label, variable) for label, variable in withdrawn if label not in named]
     for label, variable in withdrawn:
         search.progress(f"withdrawn: {label}, the residual depends on {variable}")
-    laws = [_law_leftover(search, selection, law, how) for law, how in found]
+    laws = [_law_leftover(search, selection, law, how) for law, how in found if _is_fitted(search, selection, law)]
     beliefs |= shared_beliefs(search, selection)
     return Judgement(
         search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs
@@ -357,12 +360,22 @@ def _weights_of(search: EffectSearch, selection: Selection, law: Law) -> tuple[F
     position = len(search.problem.nuisances)
     for instance in selection.fit.instances:
         count = len(instance.active)
-        term = search.problem.terms[instance.term]
-        if term.effect == UNKNOWN and term.target == law.sites and term.arguments == law.depends_on:
+        if _is_of(search.problem, instance, law):
             rows = slice(position, position + count)
             return selection.fit.mean[rows], selection.fit.covariance[rows, rows]
         position += count
     raise AssertionError("the law is in the fit")
+
+
+def _is_of(problem: RegressionProblem, instance: Instance, law: Law) -> bool:
+    """Whether an instance is a law."""
+    term = problem.terms[instance.term]
+    return is_unknown(problem, instance) and term.target == law.sites and term.arguments == law.depends_on
+
+
+def _is_fitted(search: EffectSearch, selection: Selection, law: Law) -> bool:
+    """Whether a law is in the joint fit."""
+    return any(_is_of(search.problem, instance, law) for instance in selection.fit.instances)
 
 
 def _law_leftover(search: EffectSearch, selection: Selection, law: Law, found: FoundLaw) -> Leftover:
