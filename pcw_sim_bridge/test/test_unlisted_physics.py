@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ from pcw_description.effects.kinds import (
     JointTorqueEffect,
 )
 from pcw_sim_bridge import simulated_run
-from pcw_sim_bridge.mismatch import explanation
+from pcw_sim_bridge.mismatch import explanation, open_set
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.explanation import Estimate, NamedTerm
 from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
@@ -483,3 +483,33 @@ def test_a_curve_that_has_a_closed_form_gets_it(function, basis, text):
     written = [atom.written("z") for atom in form.atoms]
     for expected in text:
         assert any(w.startswith(expected) for w in written), written
+
+
+def test_a_law_that_a_later_answer_does_without_is_not_told_and_gives_the_name_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two laws stood for a cogging that no candidate was; an effect in the second's place did without the first: an error."""
+
+    def search_with(*effects: str) -> SimpleNamespace:
+        terms = [SimpleNamespace(effect=effect, target=("drive_torque/left",), arguments=("speed",)) for effect in effects]
+        problem = SimpleNamespace(sites=object(), terms=terms, nuisances=())
+        return SimpleNamespace(problem=problem, label=lambda instance: effects[instance.term], progress=lambda said: None)
+
+    def chosen(*instances: Instance) -> SimpleNamespace:
+        fit = SimpleNamespace(instances=instances, mean=np.zeros(2), covariance=np.eye(2))
+        return SimpleNamespace(fit=fit, threshold=3.0)
+
+    name, other, law = (Instance(k, (), (0,)) for k in range(3))
+    plain, wider = search_with("friction", "cogging"), search_with("friction", "cogging", UNKNOWN)
+    of_speed = SimpleNamespace(sites=("drive_torque/left",), depends_on=("speed",))
+    found = SimpleNamespace(law=of_speed, counts=True, withdrawn=(name,), names=())
+    left = open_set.OpenSetResult((SimpleNamespace(),), (), np.zeros(1))  # type: ignore[arg-type]
+    listed = iter([None, chosen(name, other), None])
+    laws = iter([found, found, None])
+    monkeypatch.setattr(open_set, "LawSearch", lambda search, selection: SimpleNamespace(run=lambda: next(laws)))
+    monkeypatch.setattr(open_set, "_in_library", lambda search, selection, law: next(listed))
+    monkeypatch.setattr(open_set, "_adopted", lambda search, selection, how: (wider, chosen(law), of_speed))
+    monkeypatch.setattr(open_set, "OpenSetTest", lambda search, i: SimpleNamespace(run=lambda threshold: left))
+    monkeypatch.setattr(open_set, "shared_beliefs", lambda search, selection: {})
+    judged = open_set.judge(plain, chosen(name), left)  # type: ignore[arg-type]
+    assert judged.selection.fit.instances == (name, other)
+    assert judged.result.leftovers == left.leftovers
+    assert judged.withdrawn == ()
