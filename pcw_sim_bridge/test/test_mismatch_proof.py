@@ -316,6 +316,26 @@ def test_worse_is_what_is_no_chance() -> None:
     np.testing.assert_allclose(gap_closed(np.array([1.0, 1.0, 0.1]), np.array([0.1, 2.0, 0.1]), 0.1), [1.0, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("blocks", [3, 12])
+def test_the_worst_of_many_is_no_harm_where_that_is_chance(blocks: int) -> None:
+    """An IMU's clock put right, and a healthy robot's numbers a little re-tuned beside it: 'omega after 2 s' 23 % worse."""
+    rng = np.random.default_rng(blocks)
+    block = np.arange(20 * blocks) // 20
+    told = alone = 0
+    for _ in range(40):
+        # Errors of windows within a block go together.
+        change = np.repeat(rng.normal(0.0, 0.3, size=(blocks, 40)), 20, axis=0)
+        before = rng.chisquare(30, size=(20 * blocks, 40)) / 30.0
+        errors = PairedErrors.of(before, before * np.exp(change), block, rng)
+        told += bool(errors.worse(among=40).any())
+        alone += bool(errors.worse().any())
+    assert told <= 3
+    assert alone > 30
+    even = np.ones_like(before)
+    sure = PairedErrors.of(even, 1.44 * even, block, rng)
+    assert sure.worse(among=40) == pytest.approx(np.full(40, 0.2), abs=1e-6)  # the same in every block is no chance
+
+
 def test_below_its_floor_nothing_is_worse() -> None:
     """Errors that grow, but not beyond what noise leaves in any case; and one that does, by how far it does."""
     before = np.full((400, 2), 0.25)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from scipy import stats
 
 from .regression_problem import BoolArray, FloatArray, IntArray
 
@@ -21,12 +22,14 @@ class PairedErrors:
     Attributes:
         before, after: (K,); NaN where there is nothing to judge.
         before_draws, after_draws: of the bootstrap (D, K), block by block the same data in both.
+        blocks: in which there is anything to judge (K,).
     """
 
     before: FloatArray
     after: FloatArray
     before_draws: FloatArray
     after_draws: FloatArray
+    blocks: FloatArray
 
     @classmethod
     def of(cls, before: FloatArray, after: FloatArray, block: IntArray, rng: np.random.Generator) -> PairedErrors:
@@ -41,7 +44,8 @@ class PairedErrors:
         with np.errstate(invalid="ignore", divide="ignore"):
             first, second = (total.sum(axis=0) / sums[2].sum(axis=0) for total in sums[:2])
             counts = draws @ sums[2]
-            return cls(first, second, draws @ sums[0] / counts, draws @ sums[1] / counts)
+            there = np.count_nonzero(sums[2], axis=0).astype(np.float64)
+            return cls(first, second, draws @ sums[0] / counts, draws @ sums[1] / counts, there)
 
     def take(self, positions: IntArray) -> PairedErrors:
         """Return some of the quantities."""
@@ -58,27 +62,40 @@ class PairedErrors:
         share = np.ones(len(own.before)) if weights is None else weights[self.judged]
         if not len(own.before):
             nothing = np.full((DRAWS, 1), np.nan)
-            return PairedErrors(np.full(1, np.nan), np.full(1, np.nan), nothing, nothing)
+            return PairedErrors(np.full(1, np.nan), np.full(1, np.nan), nothing, nothing, np.zeros(1))
         parts = [getattr(own, field.name) for field in dataclasses.fields(own)]
         # A draw may leave out all blocks in which one quantity could be judged.
         return PairedErrors(*(_mean(part, share) for part in parts))
 
-    def worse(self, floors: FloatArray | None = None) -> FloatArray:
+    def worse(self, floors: FloatArray | None = None, among: int = 0) -> FloatArray:
         """By what part the root mean square error has grown (K,), zero where that may be chance (95 %) or it has not.
 
         Args:
             floors: squared errors (K,) below which there is no better and no worse; None: of 0.
+            among: so many quantities of which the worst will be told. What is the chance of one is not that of the worst of
+                many, nor does a bootstrap over three blocks know: then it is Student's t of the blocks, at a part of 5 %.
         """
         found = np.zeros(len(self.before))
         least = np.full(len(self.before), 1e-300) if floors is None else floors
         for k in self.judged:
-            if self._change(k, 0.025) > 0.0 and self.after[k] > self.before[k]:
+            sure = self._change(k, 0.025) > 0.0 if not among else self._is_sure_among(k, among)
+            if sure and self.after[k] > self.before[k]:
                 found[k] = max(np.sqrt(self.after[k] / max(self.before[k], least[k])) - 1.0, 0.0)
         return found
 
     def better(self) -> BoolArray:
         """Whether the error has fallen (K,), and not by chance (97.5 %)."""
         return np.array([k in self.judged and self._change(k, 0.975) < 0.0 for k in range(len(self.before))])
+
+    def _is_sure_among(self, k: int, among: int) -> bool:
+        """Whether the error of quantity k has grown by more than the worst of so many grows by chance."""
+        if self.blocks[k] < 2.0:
+            return False
+        change = self.after_draws[:, k] - self.before_draws[:, k]
+        # A bootstrap knows the spread about the mean of the blocks, that about the truth is larger.
+        spread = float(np.std(change[np.isfinite(change)])) * float(np.sqrt(self.blocks[k] / (self.blocks[k] - 1.0)))
+        least = float(stats.t.ppf(1.0 - 0.025 / among, self.blocks[k] - 1.0))
+        return bool(self.after[k] - self.before[k] > least * spread)
 
     def _change(self, k: int, quantile: float) -> float:
         """A quantile of how far the squared error of quantity k has grown."""

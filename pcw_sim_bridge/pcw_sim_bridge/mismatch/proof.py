@@ -497,14 +497,16 @@ class Prover:
         weights = _shares(explanation, problem)
         pooled = inverse.pooled(weights)
         floor = float(np.sqrt(np.average(floors[judged] ** 2, weights=weights[judged]))) if len(judged) else 0.0
-        grown = inverse.worse(floors**2)
+        looked_at = len(judged) + len(np.unique(problem.recording))
+        looked_at += 0 if self.windows is None else len(self.windows.signals) * len(HORIZONS)
+        grown = inverse.worse(floors**2, looked_at)
         worse = {problem.channels[k].name: float(grown[k]) for k in judged}
         for recording in np.unique(problem.recording):
             rows = problem.recording == recording
             block = blocks_of(problem.recording[rows], problem.time[rows])
             own = PairedErrors.of(before[rows], left[rows], block, self.rng).pooled()
-            worse[f"recording {recording + 1}"] = float(own.worse()[0])
-        rollouts, rollout_gap = self._rollout_findings(explanation, held_out, after, worse)
+            worse[f"recording {recording + 1}"] = float(own.worse(among=looked_at)[0])
+        rollouts, rollout_gap = self._rollout_findings(explanation, held_out, after, worse, looked_at)
         at = max(worse, key=lambda name: worse[name], default=None)
         harm = worse[at] if at is not None else 0.0
         main = [entry for entry in rollouts if entry.horizon == HORIZONS[MAIN_HORIZON]]
@@ -529,9 +531,13 @@ class Prover:
         )
 
     def _rollout_findings(
-        self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None, worse: dict[str, float]
+        self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None, worse: dict[str, float], looked_at: int
     ) -> tuple[tuple[RolloutProof, ...], float | None]:
-        """Errors by signal and horizon, and the part of the gap that is closed at the main horizon; adds to `worse`."""
+        """Errors by signal and horizon, and the part of the gap that is closed at the main horizon; adds to `worse`.
+
+        Args:
+            looked_at: quantities of which the one that got worst is told.
+        """
         windows = self._quiet_windows(explanation)
         if windows is None or self.before is None or after is None:
             return (), None
@@ -539,7 +545,7 @@ class Prover:
         found, gap = [], None
         for h, horizon in enumerate(HORIZONS):
             errors = _rollout_errors(windows, self.before, after, self.rng, [h])
-            grown = errors.worse(floors[h])  # what noise alone does to a simulation is no harm
+            grown = errors.worse(floors[h], looked_at)  # what noise alone does to a simulation is no harm
             for k in errors.judged:
                 signal = windows.signals[k]
                 found.append(RolloutProof(signal, horizon, float(np.sqrt(floors[h, k])), *_both(errors, k)))

@@ -99,8 +99,6 @@ class RobotProblemBuilder:
         self._read = motions
         self.model = ChannelModel(described, self.numbers, self.layout)
         self.motions = self._motions_of(self.model)
-        # Where a clock is far off columns are taken as if it were known. A running robot has no time for that.
-        self._leads = np.zeros(2) if live else clock_leads(self.motions, self.numbers)
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -118,7 +116,8 @@ class RobotProblemBuilder:
         Args:
             with_terms: False leaves out candidate effects: residual and tolerances alone are many times cheaper.
         """
-        leads = self._leads if with_terms else np.zeros(2)
+        # Where a clock is far off columns are taken as if it were known.
+        leads = clock_leads(self.motions, self.numbers) if with_terms else np.zeros(2)
         if leads.any():
             self.motions = self._motions_of(self.model, leads=leads)
         differences = ChannelDifferences(self.model, self.motions, self.filters)

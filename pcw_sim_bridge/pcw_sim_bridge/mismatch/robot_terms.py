@@ -38,6 +38,7 @@ from .regression_problem import FloatArray, LinearParameter, Shape, Term
 from .robot_effects import torque_along
 
 DIRECTIONS = 8  # of a grid over all directions
+HEIGHTS = 0.5  # of the typical height, the distance of neighbours
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 TURNED = 0.3  # [rad], of a ripple's phase, by a zero of the steering that was re-tuned; less is a detail
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
@@ -273,6 +274,7 @@ class _TermMaker:
             is_exact=not isinstance(effect, ClockEffect) or self.exact_clocks,
             is_curved=not (isinstance(effect, ClockEffect) and self.exact_clocks),
             resolution=chosen.resolution,
+            settled=_heights(effect) if {"x", "y"} == set(chosen.resolution) else {},
             grid_size=chosen.among,
             turning=turning is not None,
             # Where no torque was measured, tyres slip under the forces that the motion asks for, and its noise is in these.
@@ -427,6 +429,11 @@ def _spacing(parameter: EffectParameter, looked: Looked) -> tuple[str, float]:
     if parameter.unit == "1/rad":
         return "linear", math.pi / (2.0 * max(float(np.ptp(looked.angle.reshape(len(looked.angle), -1), axis=0).max()), 1.0))
     return "log", 2.15
+
+
+def _heights(effect: Effect) -> dict[str, tuple[float, float, float]]:
+    """How high something is whose place on the robot is searched: forces hardly say it, but a chassis on springs does."""
+    return {p.name: (HEIGHTS * p.typical, p.lower, p.upper) for p in effect.parameters if p.name == "z"}
 
 
 def _only(effect: Effect, parameter: EffectParameter) -> dict[str, float]:

@@ -19,6 +19,7 @@ from .whitened_regression import Instance
 SLOPE = "shape"  # what the terms are called that stand for shapes
 NEARBY = 0.01  # of the distance between neighbours on a shape's grid, over which its slope is taken
 WIDE = 10.0  # such distances that nothing is expected of a shape within
+USUAL = 2.0  # and those that are expected of one that nothing but slopes tells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,12 +29,17 @@ class ShapeSlope:
     Attributes:
         index: of the instance in its set; name: of the parameter.
         is_log: whether it is searched on a logarithmic scale; spacing: distance of neighbours on its grid on that scale.
+        least, largest: values that it may have.
+        deviation: that is expected of it, in distances of neighbours.
     """
 
     index: int
     name: str
     is_log: bool
     spacing: float
+    least: float = -math.inf
+    largest: float = math.inf
+    deviation: float = WIDE
 
     def interval(self, instance: Instance, half: float) -> tuple[float, float]:
         """Return the values of the parameter so many distances of neighbours to either side."""
@@ -44,7 +50,8 @@ class ShapeSlope:
         """Return the instance with the parameter so many distances of neighbours away."""
         shape = dict(instance.shape)
         away = steps * self.spacing
-        shape[self.name] = shape[self.name] * math.exp(away) if self.is_log else shape[self.name] + away
+        value = shape[self.name] * math.exp(away) if self.is_log else shape[self.name] + away
+        shape[self.name] = min(max(value, self.least), self.largest)
         return dataclasses.replace(instance, shape=tuple(sorted(shape.items())))
 
 
@@ -66,17 +73,22 @@ def with_slopes(
         # What is there or not there as a whole has a likelihood with many peaks.
         if instance.term in fixed or any(parameter.hidden for parameter in own.parameters):
             continue
+        shape, found = dict(instance.shape), []
         for name, (kind, distance) in own.resolution.items():
-            value = dict(instance.shape)[name]
-            if not kind or (kind == "log" and value <= 0.0) or (name in own.whole and value == round(value)):
+            if not kind or (kind == "log" and shape[name] <= 0.0) or (name in own.whole and shape[name] == round(shape[name])):
                 continue
-            slope = ShapeSlope(index, name, kind == "log", math.log(distance) if kind == "log" else distance)
+            found.append(ShapeSlope(index, name, kind == "log", math.log(distance) if kind == "log" else distance))
+        found += [
+            ShapeSlope(index, name, False, distance, least, largest, USUAL)
+            for name, (distance, least, largest) in own.settled.items()
+        ]
+        for slope in found:
             less, more = (slope.moved(instance, side * NEARBY) for side in (-1.0, 1.0))
             change = problem.change_between(_sized(own, instance, size), less.shape, more.shape)
             if change is None or not np.any(change):
                 continue
             slopes.append(slope)
-            terms.append(_term(name, own.target, (change / (2.0 * NEARBY))[:, :, None]))
+            terms.append(_term(slope, own.target, (change / (2.0 * NEARBY))[:, :, None]))
     return (problem.with_terms(terms) if terms else problem), slopes
 
 
@@ -98,6 +110,6 @@ def _sized(term: Term, instance: Instance, size: FloatArray) -> SizedTerm:
     return SizedTerm(instance.term, instance.shape, coefficients, instance.active)
 
 
-def _term(name: str, target: tuple[str, ...], columns: FloatArray) -> Term:
-    parameter = LinearParameter(name, "", -math.inf, math.inf, WIDE)
+def _term(slope: ShapeSlope, target: tuple[str, ...], columns: FloatArray) -> Term:
+    parameter = LinearParameter(slope.name, "", -math.inf, math.inf, slope.deviation)
     return Term(effect=SLOPE, target=target, parameters=(parameter,), shapes=({},), columns=lambda shape: columns)
