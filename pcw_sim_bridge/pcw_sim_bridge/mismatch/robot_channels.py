@@ -99,6 +99,8 @@ class RobotProblemBuilder:
         self._read = motions
         self.model = ChannelModel(described, self.numbers, self.layout)
         self.motions = self._motions_of(self.model)
+        # By how much clocks are ahead that are far off; columns are taken as if that were known.
+        self._leads = np.zeros(2)
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -116,15 +118,15 @@ class RobotProblemBuilder:
         Args:
             with_terms: False leaves out candidate effects: residual and tolerances alone are many times cheaper.
         """
-        # Where a clock is far off columns are taken as if it were known.
-        leads = clock_leads(self.motions, self.numbers) if with_terms else np.zeros(2)
-        if leads.any():
-            self.motions = self._motions_of(self.model, leads=leads)
+        if with_terms:
+            self._leads = clock_leads(self.motions, self.numbers)
+        if self._leads.any():
+            self.motions = self._motions_of(self.model, leads=self._leads)
         differences = ChannelDifferences(self.model, self.motions, self.filters)
         valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
         if with_terms and self.layout.balanced:
             self._read = with_balanced_torques(self._read, differences, valid, nuisances)
-            self.motions = self._motions_of(self.model, leads=leads)
+            self.motions = self._motions_of(self.model, leads=self._leads)
             differences = ChannelDifferences(self.model, self.motions, self.filters)
             nuisances = tuple(robot_nuisances(self.robot, differences))
         along = self._along_motions(differences)
@@ -138,10 +140,10 @@ class RobotProblemBuilder:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
             looked = Looked(left, deviation, valid, time, recording, rate, angle, *self._wheels())
-            terms = tuple(robot_terms(self.robot, differences, looked, bool(leads.any())))
-        exact = functools.partial(self._exact, differences, terms, leads)
+            terms = tuple(robot_terms(self.robot, differences, looked, bool(self._leads.any())))
+        exact = functools.partial(self._exact, differences, terms)
         residual, nominal = differences.residual, None
-        if leads.any() and (found := exact({}, ())):
+        if self._leads.any() and (found := exact({}, ())):
             residual, nominal = found[0], ChannelDifferences(self.model, self._motions_of(self.model), self.filters).residual
         return RegressionProblem(
             channels=self.channels(),
@@ -161,25 +163,20 @@ class RobotProblemBuilder:
             drifts=_drifts(terms) if self.layout.balanced else None,
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
             exact=exact,
-            derive=functools.partial(self._derive, differences, terms, leads),
+            derive=functools.partial(self._derive, differences, terms),
             softened=self._softened if self.layout.balanced else None,
             remarks=self._remarks(),
         )
 
     def _exact(
-        self,
-        differences: ChannelDifferences,
-        terms: Sequence[Term],
-        leads: FloatArray,
-        changes: Mapping[str, float],
-        sizes: Sequence[SizedTerm],
+        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
     ) -> tuple[FloatArray, Sequence[str]] | None:
         """Residual (T, C) with numbers changed and effects at work, all at once; None where they cannot be.
 
         Where clocks are ahead and no effect says so it is what the first order that is taken there makes of that.
         """
         varied = [n for n in varied_numbers(self.robot, differences) if n.label in changes]
-        pieces, unsaid = [], _unsaid(leads, terms, sizes)
+        pieces, unsaid = [], _unsaid(self._leads, terms, sizes)
         for recording in dict.fromkeys(motion.recording for motion in self._read):
             # What happened in one recording alone was not at work in another.
             own = [size for size in sizes if terms[size.term].recording in (None, recording)]
@@ -195,12 +192,7 @@ class RobotProblemBuilder:
         return residual, [*(n.label for n in varied), *(name for name in FLOOR if name in changes)]
 
     def _derive(
-        self,
-        differences: ChannelDifferences,
-        terms: Sequence[Term],
-        leads: FloatArray,
-        changes: Mapping[str, float],
-        sizes: Sequence[SizedTerm],
+        self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]
     ) -> Mapping[str, FloatArray] | None:
         """Columns (T, C) of the numbers where they are changed so and effects are at work; None where they cannot be."""
         varied = varied_numbers(self.robot, differences)
@@ -208,7 +200,7 @@ class RobotProblemBuilder:
         model = self._model_at([n for n in varied if n.label in changes], terms, changes, lasting)
         if model is None:
             return None
-        motions = self._motions_of(model, leads=_unsaid(leads, terms, lasting))
+        motions = self._motions_of(model, leads=_unsaid(self._leads, terms, lasting))
         there = ChannelDifferences(model, motions, self.filters)
         columns = on_all_cores(lambda n: there.of_numbers(n.vary, TANGENT_STEP * n.deviation), varied)
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
