@@ -61,6 +61,7 @@ DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_latera
 # Part of a tolerance over which a number's column is taken anew: by a wider one's curvature an effect on it would be told
 # from the number itself, which is the same thing.
 TANGENT_STEP = 0.01
+# The effect that says by how much the stamps of IMU and tracker are ahead, and its numbers in that order.
 CLOCKS, CLOCK_NUMBERS = "clock_offset", ("offset", "tracker_offset")
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
