@@ -12,11 +12,18 @@ from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
+from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, sliding, used_friction
 from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
-from pcw_sim_bridge.mismatch.rolling_model import ChannelLayout, ModelNumbers
+from pcw_sim_bridge.mismatch.rolling_model import (
+    ChannelLayout,
+    ModelNumbers,
+    Surroundings,
+    channel_sides,
+    wheel_motion,
+)
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.simulated_run import record_run
 
@@ -202,6 +209,30 @@ def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, ch
     for channel in range(column.shape[1]):
         size, off = np.linalg.norm(slope[:, channel]), np.linalg.norm(column[:, channel] - slope[:, channel])
         assert off <= most * size, problem.channels[channel].name
+
+
+def test_how_wheels_move_is_taken_over_only_where_they_move_so(tmp_path: Path) -> None:
+    """Of every number of the model and all that surroundings hold: channels are those that nothing known before makes."""
+    builder = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 1)], 5.0)
+    motion, numbers, layout = builder.motions[0], builder.numbers, builder.layout
+    known = Surroundings(wheels=wheel_motion(motion, numbers))
+    shape = motion.position.shape
+    cases = [(dataclasses.replace(motion, velocity=1.1 * motion.velocity), numbers, known)]
+    for name, value in vars(numbers).items():
+        other = numbers.copy()
+        if isinstance(value, ChassisSway):
+            value = dataclasses.replace(value, frequency=1.1 * value.frequency)
+        else:
+            value = 1.01 * value + 0.001
+        setattr(other, name, value)
+        cases.append((motion, other, known))
+    for name, size in (("torque", shape), ("radius", shape[:2]), ("grip", shape[:2]), ("climb", shape), ("height", shape[:2]),
+                       ("pull", (shape[0], 2))):  # fmt: skip
+        changed = np.abs(np.random.default_rng(1).normal(0.0, 0.01, size))
+        cases.append((motion, numbers, dataclasses.replace(known, **{name: changed})))
+    for moved, other, around in cases:
+        anew = channel_sides(moved, other, layout, dataclasses.replace(around, wheels=None))
+        assert all(np.array_equal(a, b) for a, b in zip(channel_sides(moved, other, layout, around), anew, strict=True))
 
 
 def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_does(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 
@@ -41,7 +40,8 @@ class ChannelDifferences:
             straight = StraightTyres.about(model.numbers, state.force, state.grip)
             self._states.append(state)
             places = model.wheel_places(motion)
-            self._around.append(dataclasses.replace(around, straight=straight, normal=normal, places=places))
+            known = dataclasses.replace(around, straight=straight, normal=normal, places=places, wheels=state.wheels)
+            self._around.append(known)
         self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
         self.known = [np.isfinite(measured) for measured, _ in self._sides]
         self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])
@@ -55,7 +55,7 @@ class ChannelDifferences:
 
     def of_numbers(self, vary: Callable[[ModelNumbers, float], None], step: float) -> FloatArray:
         """Column (T, C): what the residual holds per unit by which a number of the model is off."""
-        numbers = copy.deepcopy(self.model.numbers)
+        numbers = self.model.numbers.copy()
         vary(numbers, step)
         pieces = []
         for motion, around, plain in zip(self.motions, self._around, self._sides, strict=True):

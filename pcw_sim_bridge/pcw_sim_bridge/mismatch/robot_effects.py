@@ -384,13 +384,14 @@ class ChannelModel:
                 torque[:, i, axis] += found[:, 0]
             return dataclasses.replace(around, torque=torque)
         under, height, normal = self._under_wheels(motion, around, instance, normal)
-        radius = np.zeros(shape[:2]) if around.radius is None else around.radius.copy()
+        # What nothing is added to stays the array that it was: how the wheels move depends on nothing else of the floor.
+        radius, climb = around.radius, around.climb
         grip = np.ones(shape[:2]) if around.grip is None else around.grip.copy()
         for i, found in under.items():
-            radius[:, i] += found[:, RADIUS_CHANGE]
+            if found[:, RADIUS_CHANGE].any():
+                radius = np.zeros(shape[:2]) if radius is None else radius.copy()
+                radius[:, i] += found[:, RADIUS_CHANGE]
             grip[:, i] *= found[:, FRICTION]
-        climb = around.climb
-        for i, found in under.items():
             torque[:, i, DRIVE] -= normal[:, i] * found[:, RADIUS_SLOPE]
             gradient = found[:, [GRADIENT_X, GRADIENT_Y]]
             if gradient.any():
@@ -416,13 +417,14 @@ class ChannelModel:
 
     def _under_wheels(
         self, motion: RobotMotion, around: Surroundings, instance: EffectInstance, normal: FloatArray
-    ) -> tuple[dict[int, FloatArray], FloatArray, FloatArray]:
+    ) -> tuple[dict[int, FloatArray], FloatArray | None, FloatArray]:
         """What a contact's effect does under each of its wheels, and what that does to all of them.
 
         A wheel that gives way under its load hands a part of it to the others, and gives way less.
 
         Returns:
-            By wheel (T, CONTACT_RESULTS); heights of the axles (T, n) [m] and normal forces (T, n) [N] with it at work.
+            By wheel (T, CONTACT_RESULTS); heights of the axles (T, n) [m], None where nothing lifts them, and normal forces
+            (T, n) [N] with it at work.
         """
         effect = get(instance.name)
         assert isinstance(effect, ContactEffect)
@@ -435,6 +437,8 @@ class ChannelModel:
             load = np.ascontiguousarray(normal[:, casters].T)
             results = _contacts_along(effect.contact, values, motion.time, places, roll_angle, load)
             under = dict(zip(casters, results, strict=True))
+            if around.height is None and not results[:, :, [HEIGHT, RADIUS_CHANGE]].any():
+                return under, None, normal
             before, height = height, np.zeros(motion.position.shape[:2]) if around.height is None else around.height.copy()
             for i, found in under.items():
                 height[:, i] += found[:, HEIGHT] + found[:, RADIUS_CHANGE]

@@ -27,6 +27,7 @@ three, as on a tricycle, wheels cannot contradict each other and the tracked pos
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -55,6 +56,11 @@ from .regression_problem import Channel, FloatArray
 from .robot_motion import RobotMotion, tracked_place
 from .signal_filter import derivative
 
+# Of the numbers of the model those that say nothing of how wheels move, but what is felt, sensed and slips.
+OF_NO_MOTION = frozenset((
+    "gain", "torque_lag", "unreported", "tyres", "softness", "imu_position", "gyro_bias", "gyro_scale", "accelerometer_bias",
+    "accelerometer_scale", "imu_lean", "clock", "tracked",
+))  # fmt: skip
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
 
@@ -180,6 +186,7 @@ class Surroundings:
         straight: the tyres' curves straightened about where they are without a small change; None: the curves themselves.
         normal: loads of the wheels along the motion, on level ground (T, n) [N]; None: to be found when they are needed.
         places: of the wheels in the world, by caster (n, T, 2) [m]; None as above.
+        wheels: how the wheels move along the motion; None, or another one: to be found.
     """
 
     torque: FloatArray | None = None
@@ -191,6 +198,7 @@ class Surroundings:
     straight: StraightTyres | None = None
     normal: FloatArray | None = None
     places: FloatArray | None = None
+    wheels: WheelMotion | None = None
 
 
 NOTHING = Surroundings()
@@ -250,6 +258,26 @@ class ModelNumbers:
     imu_lean: FloatArray
     detuning: FloatArray
     sway: ChassisSway
+
+    def copy(self) -> ModelNumbers:
+        """Return one whose numbers may be changed."""
+        other = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(other, name, value.copy())
+        return other
+
+    def moves_as(self, other: ModelNumbers) -> bool:
+        """Whether wheels that do not slip move alike under both."""
+        if self is other:
+            return True
+        theirs = vars(other)
+        return all(
+            value is theirs[name] or (isinstance(value, np.ndarray) and np.array_equal(value, theirs[name])) or (
+                isinstance(value, float) and value == theirs[name]
+            )
+            for name, value in vars(self).items() if name not in OF_NO_MOTION
+        )  # fmt: skip
 
     @property
     def total_mass(self) -> float:
@@ -653,20 +681,24 @@ def _tilt(numbers: ModelNumbers, leaning: FloatArray, lean: FloatArray, directio
 
 
 @dataclasses.dataclass(frozen=True)
-class RollingState:
-    """How the wheels of a robot roll along a motion, before their slip.
+class WheelMotion:
+    """How the wheels of a robot move along a motion before their slip: whatever friction there is, and whatever torque.
 
     Attributes:
+        motion: of the joints; numbers: of the model; radius_change, pull, height: of the `Surroundings` it was made with.
         steer_angle, radius: true headings [rad] and rolling radii [m] (T, n); direction: `directions` of the former.
         offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m].
         velocity: joint rates that wheels of the described radius would have (T, n, 2).
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
-        grip, speed: load times friction factor [N] and rolling speed [m/s] (T, n + k), fixed axles last.
-        spin: torque of the ground on each wheel about the vertical (T, n) [N m].
-        force: of the tyres in the wheel frames (T, n + k, 2) [N].
-        load: the same with what sloping ground pushes besides, which is what the base feels (T, n + k, 2) [N].
+        felt: the latter of a robot on level ground under the same forces (T, 3); tilt: of its chassis (T, 2).
+        normal, speed: loads [N] and rolling speeds [m/s] (T, n + k), fixed axles last.
     """
 
+    motion: RobotMotion
+    numbers: ModelNumbers
+    radius_change: FloatArray | None
+    pull: FloatArray | None
+    height: FloatArray | None
     steer_angle: FloatArray
     direction: FloatArray
     radius: FloatArray
@@ -675,17 +707,40 @@ class RollingState:
     twist: FloatArray
     twist_dot: FloatArray
     contradiction: FloatArray
-    grip: FloatArray
+    felt: FloatArray
+    tilt: FloatArray
+    normal: FloatArray
     speed: FloatArray
+
+    def holds_for(self, motion: RobotMotion, numbers: ModelNumbers, around: Surroundings) -> bool:
+        """Whether it is that of this very motion and of these surroundings, and of such numbers."""
+        made_with = self.motion, self.radius_change, self.pull, self.height
+        asked = motion, around.radius, around.pull, around.height
+        same = all(one is other for one, other in zip(made_with, asked, strict=True))
+        return same and self.numbers.moves_as(numbers)
+
+
+@dataclasses.dataclass(frozen=True)
+class RollingState:
+    """How the wheels of a robot roll along a motion, before their slip.
+
+    Attributes:
+        wheels: how they move.
+        grip: load times friction factor (T, n + k) [N], fixed axles last.
+        spin: torque of the ground on each wheel about the vertical (T, n) [N m].
+        force: of the tyres in the wheel frames (T, n + k, 2) [N].
+        load: the same with what sloping ground pushes besides, which is what the base feels (T, n + k, 2) [N].
+    """
+
+    wheels: WheelMotion
+    grip: FloatArray
     spin: FloatArray
     force: FloatArray
     load: FloatArray
 
 
-def rolling_state(
-    motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
-) -> RollingState:
-    """Return how the wheels roll along a motion, and the forces under them."""
+def wheel_motion(motion: RobotMotion, numbers: ModelNumbers, around: Surroundings = NOTHING) -> WheelMotion:
+    """Return how the wheels move along a motion."""
     steer_angle = numbers.headings(motion.position)
     if numbers.heading_lead:
         steer_angle += numbers.heading_lead * motion.velocity[:, :, STEER]
@@ -709,15 +764,29 @@ def rolling_state(
         twist, contradiction = _twists(numbers, steer_angle, direction, velocity, offset)
         twist_dot = derivative(twist, motion.rate)
     felt = _without(twist_dot, pull)
-    n = len(numbers.steer_axis)
     normal = normal_forces(numbers, direction, acceleration_of(twist, felt), around.height)
-    grip = np.maximum(normal, 1.0)
-    if around.grip is not None:
-        grip[:, :n] = np.maximum(normal[:, :n] * around.grip, 1.0)
     speed = np.concatenate([np.abs(velocity[:, :, DRIVE] * numbers.radius), _axle_speeds(numbers, twist)], axis=1)
+    return WheelMotion(
+        motion, numbers, around.radius, around.pull, around.height,
+        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, felt, tilt, normal, speed,
+    )  # fmt: skip
+
+
+def rolling_state(
+    motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
+) -> RollingState:
+    """Return how the wheels roll along a motion, and the forces under them."""
+    wheels = around.wheels
+    if wheels is None or not wheels.holds_for(motion, numbers, around):
+        wheels = wheel_motion(motion, numbers, around)
+    direction, offset, velocity, twist, felt = wheels.direction, wheels.offset, wheels.velocity, wheels.twist, wheels.felt
+    n = len(numbers.steer_axis)
+    grip = np.maximum(wheels.normal, 1.0)
+    if around.grip is not None:
+        grip[:, :n] = np.maximum(wheels.normal[:, :n] * around.grip, 1.0)
     patches = numbers.tyres[:n].copy()
     patches[:, LAMBDA] *= numbers.softness[:n, 0]  # the edge of a patch slips as the tyre does
-    spin = _scrub(patches, velocity[:, :, STEER] + twist[:, 2:], speed, grip)
+    spin = _scrub(patches, velocity[:, :, STEER] + twist[:, 2:], wheels.speed, grip)
     if layout.balanced:
         # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads
         # of tyres, would be found as small, or as large, as makes that noise least.
@@ -726,11 +795,11 @@ def rolling_state(
         if numbers.unreported.any():
             added += np.sum(numbers.unreported * motion.loops, axis=3)
         if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
-            added[:, :, DRIVE] += radius * around.climb[:, :, 0]
+            added[:, :, DRIVE] += wheels.radius * around.climb[:, :, 0]
         load, force = (
             _contact_forces(
-                numbers.modules, numbers.steer_axis, offset, radius, direction, velocity, motion.acceleration, torque + added,
-                spin, twist, felt, normal, tilt,
+                numbers.modules, numbers.steer_axis, offset, wheels.radius, direction, velocity, motion.acceleration,
+                torque + added, spin, twist, felt, wheels.normal, wheels.tilt,
             )
             for torque in (motion.torque, motion.quiet_torque)
         )  # fmt: skip
@@ -740,10 +809,8 @@ def rolling_state(
         wrench = inertial_wrench(numbers, motion, direction, twist, felt)
         if around.climb is not None:
             wrench = wrench - _wrench_of(numbers.steer_axis, offset, direction, around.climb, np.zeros_like(spin))
-        force = load = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, steer_angle, wrench)
-    return RollingState(
-        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, grip, speed, spin, force, load
-    )
+        force = load = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, wheels.steer_angle, wrench)
+    return RollingState(wheels, grip, spin, force, load)
 
 
 def _without(twist_dot: FloatArray, pull: FloatArray) -> FloatArray:
@@ -773,22 +840,23 @@ def channel_sides(
         around: what else is at work.
     """
     state = rolling_state(motion, numbers, layout, around)
-    slip = slips(numbers, motion.rate, state.speed, state.force, state.grip, around.straight)
-    slip_twist, slip_contradiction = rigid_motions(numbers, state.steer_angle, state.direction, slip, state.offset)
-    twist = state.twist - slip_twist
+    wheels = state.wheels
+    slip = slips(numbers, motion.rate, wheels.speed, state.force, state.grip, around.straight)
+    slip_twist, slip_contradiction = rigid_motions(numbers, wheels.steer_angle, wheels.direction, slip, wheels.offset)
+    twist = wheels.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)
     leaning = _leaning(numbers, motion.rate, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
         measured.append(
-            _wrench_of(numbers.steer_axis, state.offset, state.direction, state.load, state.spin)
+            _wrench_of(numbers.steer_axis, wheels.offset, wheels.direction, state.load, state.spin)
         )
-        wrench = inertial_wrench(numbers, motion, state.direction, twist, twist_dot)
+        wrench = inertial_wrench(numbers, motion, wheels.direction, twist, twist_dot)
         if leaning is not None:
             wrench[:, :2] -= numbers.total_mass * derivative(derivative(leaning, motion.rate), motion.rate)
         predicted.append(wrench)
     if layout.redundant:
-        measured.append(state.contradiction.reshape(len(twist), -1))
+        measured.append(wheels.contradiction.reshape(len(twist), -1))
         predicted.append(slip_contradiction.reshape(len(twist), -1))
     if layout.imu:
         x, y = numbers.imu_position
@@ -803,7 +871,7 @@ def channel_sides(
         if numbers.imu_lean.any():
             # A sensor that leans feels a part of its weight.
             leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
-            sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, state.direction)
+            sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, wheels.direction)
         predicted.append(sensed)
     if layout.pose:
         late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0

@@ -18,7 +18,14 @@ from pcw_description.robot_description import DRIVE, STEER
 
 from .regression_problem import FloatArray
 from .robot_motion import RobotMotion
-from .rolling_model import ChannelLayout, ModelNumbers, RollingState, StraightTyres, inertial_wrench
+from .rolling_model import (
+    ChannelLayout,
+    ModelNumbers,
+    RollingState,
+    StraightTyres,
+    WheelMotion,
+    inertial_wrench,
+)
 from .signal_filter import derivative
 
 
@@ -43,20 +50,20 @@ class TorqueResponse:
         """
         self.layout = layout
         count, n = state.force.shape[:2]
-        steer_angle = state.steer_angle
+        wheels = state.wheels
         # Forces in the wheel frames per joint torque (T, n, 2, 2).
         of_torque = np.zeros((count, n, 2, 2))
-        offset_x, offset_y = state.offset[:, :, 0], state.offset[:, :, 1]
+        offset_x, offset_y = wheels.offset[:, :, 0], wheels.offset[:, :, 1]
         of_torque[:, :, 0, DRIVE] = 1.0 / numbers.radius
         of_torque[:, :, 1, DRIVE] = offset_y / offset_x / numbers.radius
         of_torque[:, :, 1, STEER] = -1.0 / offset_x
         self._ratio_of_torque = (numbers.softness[:, :, None] * straight.of_force) @ of_torque
-        self._rate, self._speed, self._length = motion.rate, state.speed[:, :, None, None], numbers.tyres[:n, LENGTH]
-        jacobian, self._rigid = _rigid_maps(numbers.steer_axis, state.offset, steer_angle)
+        self._rate, self._speed, self._length = motion.rate, wheels.speed[:, :, None, None], numbers.tyres[:n, LENGTH]
+        jacobian, self._rigid = _rigid_maps(numbers.steer_axis, wheels.offset, wheels.steer_angle)
         wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
         self._wrench_of_torque = np.einsum("tcnf,tnfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
-        self._inertia, self._turning = _inertia_slopes(numbers, motion, state)
-        self._imu_position, self._twist = numbers.imu_position, state.twist
+        self._inertia, self._turning = _inertia_slopes(numbers, motion, wheels)
+        self._imu_position, self._twist = numbers.imu_position, wheels.twist
         self._imu_scale = np.array([numbers.gyro_scale, *numbers.accelerometer_scale])
 
     @property
@@ -137,9 +144,9 @@ def _rigid_maps(steer_axis, offset, steer_angle):  # type: ignore[no-untyped-def
     return jacobians, maps
 
 
-def _inertia_slopes(numbers: ModelNumbers, motion: RobotMotion, state: RollingState) -> tuple[FloatArray, FloatArray]:
+def _inertia_slopes(numbers: ModelNumbers, motion: RobotMotion, wheels: WheelMotion) -> tuple[FloatArray, FloatArray]:
     """Slopes of the inertial wrench over the twist's derivative and over the twist, (T, 3, 3) each."""
-    direction, twist, twist_dot = state.direction, state.twist, state.twist_dot
+    direction, twist, twist_dot = wheels.direction, wheels.twist, wheels.twist_dot
     plain = inertial_wrench(numbers, motion, direction, twist, twist_dot)
     inertia, turning = np.empty((len(twist), 3, 3)), np.empty((len(twist), 3, 3))
     step = 1e-3
