@@ -574,6 +574,8 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
                 slope, deviation = beside_all[index, name]
                 first, last = slope.interval(instance, HALF_WIDTH * deviation)
                 low, high = min(low, first), max(high, last)
+            blur = HALF_WIDTH * term.blur.get(name, 0.0)
+            low, high = value - math.hypot(value - low, blur), value + math.hypot(high - value, blur)
             estimates[name] = Estimate(value, "", low, high)
         if instance.term in search.outlines:
             estimates = _as_wide(estimates, term, instance, search.outlines[instance.term], DROP * wider)
