@@ -27,7 +27,7 @@ from .evidence_selection import EffectSearch, Selection
 from .leftover_expression import plain_forms
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
-from .regression_problem import UNKNOWN, FloatArray, RegressionProblem, Term
+from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem, Term
 from .unknown_law import Combination, Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -38,9 +38,9 @@ LAW_MARGIN = 15.0
 HYPOTHESES_COST = 8.0
 # Samples of a channel count as so many fewer in the screening, where the colour of the noise is not looked at.
 SCREENING_CORRELATION = 5.0
-# At most so many samples are looked at in the screening.
-SCREENED_SAMPLES = 400
-FINALISTS = 4
+# What is screened are the means of about so many stretches: laws are slow, and the noise of forces is not.
+SCREENED_STRETCHES = 400
+FINALISTS = 10
 FOLDS = 5
 # A law must move some channel by this part of the rms that it leaves there, and by this part of the measured side.
 SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
@@ -443,10 +443,10 @@ class _Screen:
     def __init__(self, search: EffectSearch, laws: Sequence[Law]) -> None:
         assert search.problem.sites is not None
         self.search, self.problem, self.sites, self.laws = search, search.problem, search.problem.sites, laws
-        self.step = max(1, round(len(self.problem.time) / SCREENED_SAMPLES))
+        self.step = max(1, round(len(self.problem.time) / SCREENED_STRETCHES))
         self._bases = self._filtered_bases()
         self._moved = np.flatnonzero(np.any([np.abs(b).max(axis=0) > 0.0 for b in self._bases.values()], axis=0))
-        self._variables = {name: values[:: self.step] for name, values in self.problem.variables.items()}
+        self._variables = {name: values[self._middles] for name, values in self.problem.variables.items()}
         self._functions: dict[tuple[object, object], FloatArray] = {}
         fast = [law for law in self.laws if _is_fast(law)]
         self._exact = dict(zip(fast, on_all_cores(self._exact_columns, fast), strict=True))
@@ -454,9 +454,9 @@ class _Screen:
     def scores(self, sets: Sequence[tuple[Instance, ...]]) -> list[list[tuple[float, FloatArray]]]:
         """Return roughly the nats that each law gains beside each set, penalised for its number of functions; and its weights.
 
-        Without regard to the colour of the noise, and on every few samples only.
+        Without regard to the colour of the noise.
         """
-        bases = {key: np.ascontiguousarray(base[:: self.step, self._moved]) for key, base in self._bases.items()}
+        bases = {key: self._averaged(base) for key, base in self._bases.items()}
         return [self._scores_beside(_Screened(bases, *self._beside(instances))) for instances in sets]
 
     def _scores_beside(self, screened: _Screened) -> list[tuple[float, FloatArray]]:
@@ -479,25 +479,41 @@ class _Screen:
 
     def _beside(self, instances: tuple[Instance, ...]) -> tuple[FloatArray, FloatArray, FloatArray, float, float]:
         """Weights, what tolerances and set span, what they leave, its square, and independent rows, for one set."""
-        problem, moved, step = self.problem, self._moved, self.step
-        residual = self.search.residual_of(instances)
-        valid = problem.valid[::step, moved]
-        deviation = np.array([robust_deviation(residual[problem.valid[:, c], c]) for c in moved])
-        weight = np.where(valid, np.sqrt(huber_weights(residual[::step, moved] / deviation)) / deviation, 0.0)
+        problem = self.problem
+        residual = self._averaged(self.search.residual_of(instances))
+        valid = self._averaged(np.ones_like(problem.residual)) > 0.5
+        deviation = np.array([robust_deviation(left[seen]) for left, seen in zip(residual.T, valid.T, strict=True)])
+        weight = np.where(valid, np.sqrt(huber_weights(residual / deviation)) / deviation, 0.0)
         parts = [problem.nuisance_columns() * problem.nuisance_deviations()]
         for instance in instances:
             parameters = problem.terms[instance.term].parameters
             scale = np.array([parameters[k].deviation for k in instance.active])
             parts.append(problem.columns(instance.term, instance.shape)[..., list(instance.active)] * scale)
-        design = np.concatenate(parts, axis=2)[::step, moved]
+        design = self._averaged(np.concatenate(parts, axis=2))
         design = (design * weight[:, :, None]).reshape(weight.size, -1)
         # The tolerances come in as further rows.
         known, _ = np.linalg.qr(np.concatenate([design, np.eye(design.shape[1])]))
         known = known[: len(design)]
-        target = (problem.residual[::step, moved] * weight).ravel()
+        target = (self._averaged(problem.residual) * weight).ravel()
         projection = known.T @ target
         total = float(target @ target - projection @ projection)
-        return weight, known, target - known @ projection, total, float(valid.sum()) * min(step / SCREENING_CORRELATION, 1.0)
+        rows = float(valid.sum()) * min(self.step / SCREENING_CORRELATION, 1.0)
+        return weight, known, target - known @ projection, total, rows
+
+    @property
+    def _middles(self) -> IntArray:
+        """The middle sample of every stretch (S,)."""
+        firsts = np.arange(0, len(self.problem.time), self.step)
+        return (firsts + np.minimum(firsts + self.step, len(self.problem.time)) - 1) // 2
+
+    def _averaged(self, values: FloatArray) -> FloatArray:
+        """Means over the stretches (S, M, ...) of values (T, C, ...) in the channels that laws move; zero if not judged."""
+        more = (1,) * (values.ndim - 2)
+        judged = np.where(self.problem.valid[:, self._moved].reshape(len(values), -1, *more), values[:, self._moved], 0.0)
+        firsts = np.arange(0, len(values), self.step)
+        counts = np.diff(firsts, append=len(values)).reshape(-1, 1, *more)
+        means: FloatArray = np.add.reduceat(judged, firsts, axis=0) / counts
+        return means
 
     def _filtered_bases(self) -> dict[tuple[str, Factor], FloatArray]:
         """One filtered column (T, C) per site and factor."""
@@ -514,7 +530,7 @@ class _Screen:
         return found
 
     def _exact_columns(self, law: Law) -> FloatArray:
-        return np.ascontiguousarray(self.sites.columns(law.torques(self.sites))[:: self.step, self._moved])
+        return self._averaged(self.sites.columns(law.torques(self.sites)))
 
     def _of(self, law: Law, place: Place) -> FloatArray:
         key = (law.basis, place.arguments)
