@@ -99,7 +99,7 @@ CONCEALED = [
 
 @pytest.mark.parametrize("entry", CONCEALED, ids=lambda entry: str(entry["name"]))
 def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object], tmp_path: Path) -> None:
-    excitation = make_excitation("identification", THESIS, None, 11)
+    excitation = make_excitation("identification", THESIS, 25.0, 11)
     true = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
     record_run(true, excitation.twist, excitation.duration, 11, tmp_path / "run", "reduced", controlled_as=THESIS)
     findings = analyse(RobotSubject(THESIS), [tmp_path / "run"], [], {}, 0, lambda message: None).findings

@@ -228,7 +228,7 @@ def test_a_motor_that_is_much_weaker_one_way_is_no_gear_friction(tmp_path, monke
     ],
 )
 def test_a_law_as_small_as_the_name_that_it_replaces_is_told_of(part, excitation, seed, tmp_path, monkeypatch):
-    """It lies below the noise, as the name does, and is held to be as small; seed 3 was nothing, the others a constant load."""
+    """It lies below the noise, as the name does, and is held to be as small; seed 3 was nothing, others a constant load."""
     law = functools.partial(uneven_gain, part=part)
     findings = analysed(record(tmp_path / "run", law, seed, monkeypatch, excitation, 30.0)).findings
     assert (findings.verdict, findings.effects) == ("unexplained", ())

@@ -88,22 +88,18 @@ def searched_outline(
     Where the effect itself would have to be of a size that cannot be, nothing is searched.
 
     Args:
-        before: what an earlier search found alike, under another fit.
+        before: what an earlier search found alike, under another fit: this one goes on from the best of it.
     """
     trials = _Tried(ShapeTrials(regression, others, instance), instance)
     own = np.array([dict(instance.shape)[name] for name in OUTLINE])
     if not math.isfinite(trials.evidence([own])[0]):
         return instance, before
-    starts = [own, *_starts(own)]
-    if before is not None:
+    if before is None:
+        trials.look_around(own)
+    else:  # the fit has changed a little since, and with it which of those that were good is best
         near = before.outlines[before.evidence > before.evidence.max() - NEARLY]
-        starts += list(near[:: math.ceil(len(near) / MOST_BEFORE)])
-    order = 1 + np.argsort([-value for value in trials.evidence(starts)[1:]])
-    reached = [trials.climb(starts[k]) for k in (0, *order[:STARTS])]
-    for small in _small_discs(own) if before is None else []:
-        best = np.argsort([-value for value in trials.evidence(small)])[:SMALL_STARTS]
-        reached += [trials.climb(small[k]) for k in best]
-    trials.spread([*reached, *(starts[k] for k in order)])
+        trials.evidence(list(near[:: math.ceil(len(near) / MOST_BEFORE)]))
+        trials.climb(own)
     trials.settle()
     return trials.best(), trials.all_tried()
 
@@ -166,6 +162,16 @@ class _Tried:
             self._known[key] = trial.evidence if trial.allowed else -math.inf
             self._coefficients[key] = trial.coefficients
         return [self._known[key] for key in keys]
+
+    def look_around(self, own: FloatArray) -> None:
+        """Try outlines of all kinds about one, move the best border by border, and go on along all that are as good."""
+        starts = [own, *_starts(own)]
+        order = 1 + np.argsort([-value for value in self.evidence(starts)[1:]])
+        reached = [self.climb(starts[k]) for k in (0, *order[:STARTS])]
+        for small in _small_discs(own):
+            best = np.argsort([-value for value in self.evidence(small)])[:SMALL_STARTS]
+            reached += [self.climb(small[k]) for k in best]
+        self.spread([*reached, *(starts[k] for k in order)])
 
     def climb(self, outline: FloatArray) -> FloatArray:
         """Move borders, middle and direction of an outline as long as one of these gains; return where it ends."""
