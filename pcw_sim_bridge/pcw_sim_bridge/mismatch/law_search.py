@@ -27,7 +27,7 @@ from .evidence_selection import EffectSearch, Selection
 from .leftover_expression import plain_forms
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
-from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem, Term
+from .regression_problem import UNKNOWN, FloatArray, RegressionProblem, Term
 from .unknown_law import Combination, Factor, Law, Place, combined, factor_values, hypotheses
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
 
@@ -38,8 +38,8 @@ LAW_MARGIN = 15.0
 HYPOTHESES_COST = 8.0
 # Samples of a channel count as so many fewer in the screening, where the colour of the noise is not looked at.
 SCREENING_CORRELATION = 5.0
-# What is screened are the means of about so many stretches: laws are slow, and the noise of forces is not.
-SCREENED_STRETCHES = 400
+# Means of at most so many stretches are screened, none longer than this [s]: laws are slow, and the noise of forces is not.
+SCREENED_STRETCHES, LONGEST_STRETCH = 400, 0.3
 FINALISTS = 10
 FOLDS = 5
 # A law must move some channel by this part of the rms that it leaves there, and by this part of the measured side.
@@ -444,9 +444,12 @@ class _Screen:
         assert search.problem.sites is not None
         self.search, self.problem, self.sites, self.laws = search, search.problem, search.problem.sites, laws
         self.step = max(1, round(len(self.problem.time) / SCREENED_STRETCHES))
+        length = min(self.step, max(1, round(LONGEST_STRETCH * self.problem.rate)))
+        self._stretches = np.arange(0, len(self.problem.time) - length + 1, self.step)[:, None] + np.arange(length)
         self._bases = self._filtered_bases()
         self._moved = np.flatnonzero(np.any([np.abs(b).max(axis=0) > 0.0 for b in self._bases.values()], axis=0))
-        self._variables = {name: values[self._middles] for name, values in self.problem.variables.items()}
+        middles = self._stretches[:, length // 2]
+        self._variables = {name: values[middles] for name, values in self.problem.variables.items()}
         self._functions: dict[tuple[object, object], FloatArray] = {}
         fast = [law for law in self.laws if _is_fast(law)]
         self._exact = dict(zip(fast, on_all_cores(self._exact_columns, fast), strict=True))
@@ -482,37 +485,30 @@ class _Screen:
         problem = self.problem
         residual = self._averaged(self.search.residual_of(instances))
         valid = self._averaged(np.ones_like(problem.residual)) > 0.5
-        deviation = np.array([robust_deviation(left[seen]) for left, seen in zip(residual.T, valid.T, strict=True)])
+        pairs = zip(residual.T, valid.T, strict=True)
+        deviation = np.array([robust_deviation(left[seen]) if seen.any() else 1.0 for left, seen in pairs])
         weight = np.where(valid, np.sqrt(huber_weights(residual / deviation)) / deviation, 0.0)
         parts = [problem.nuisance_columns() * problem.nuisance_deviations()]
         for instance in instances:
             parameters = problem.terms[instance.term].parameters
             scale = np.array([parameters[k].deviation for k in instance.active])
             parts.append(problem.columns(instance.term, instance.shape)[..., list(instance.active)] * scale)
-        design = self._averaged(np.concatenate(parts, axis=2))
+        design = np.concatenate([self._averaged(part) for part in parts], axis=2)
         design = (design * weight[:, :, None]).reshape(weight.size, -1)
         # The tolerances come in as further rows.
         known, _ = np.linalg.qr(np.concatenate([design, np.eye(design.shape[1])]))
         known = known[: len(design)]
         target = (self._averaged(problem.residual) * weight).ravel()
         projection = known.T @ target
-        total = float(target @ target - projection @ projection)
-        rows = float(valid.sum()) * min(self.step / SCREENING_CORRELATION, 1.0)
+        total = max(float(target @ target - projection @ projection), 1e-300)  # nothing may be judged for half a stretch
+        rows = max(float(valid.sum()) * min(self.step / SCREENING_CORRELATION, 1.0), 1.0)
         return weight, known, target - known @ projection, total, rows
-
-    @property
-    def _middles(self) -> IntArray:
-        """The middle sample of every stretch (S,)."""
-        firsts = np.arange(0, len(self.problem.time), self.step)
-        return (firsts + np.minimum(firsts + self.step, len(self.problem.time)) - 1) // 2
 
     def _averaged(self, values: FloatArray) -> FloatArray:
         """Means over the stretches (S, M, ...) of values (T, C, ...) in the channels that laws move; zero if not judged."""
-        more = (1,) * (values.ndim - 2)
-        judged = np.where(self.problem.valid[:, self._moved].reshape(len(values), -1, *more), values[:, self._moved], 0.0)
-        firsts = np.arange(0, len(values), self.step)
-        counts = np.diff(firsts, append=len(values)).reshape(-1, 1, *more)
-        means: FloatArray = np.add.reduceat(judged, firsts, axis=0) / counts
+        judged = self.problem.valid[self._stretches][:, :, self._moved]
+        picked = values[self._stretches][:, :, self._moved]
+        means: FloatArray = np.where(judged.reshape(*judged.shape, *(1,) * (values.ndim - 2)), picked, 0.0).mean(axis=1)
         return means
 
     def _filtered_bases(self) -> dict[tuple[str, Factor], FloatArray]:
