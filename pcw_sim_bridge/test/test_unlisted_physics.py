@@ -219,18 +219,18 @@ def test_a_motor_that_is_much_weaker_one_way_is_no_gear_friction(tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("part", "excitation", "seed"),
+    ("part", "excitation", "duration", "seed"),
     [
-        pytest.param(0.02, "identification", 3, marks=pytest.mark.nightly),
-        (0.02, "identification", 4),
+        pytest.param(0.02, "identification", 25.0, 3, marks=pytest.mark.nightly),
+        (0.02, "identification", 25.0, 4),
         # Looked at sample by sample it is one of many laws that noise makes look better.
-        (0.014, "chirps", 6),
+        (0.014, "chirps", 30.0, 6),
     ],
 )
-def test_a_law_as_small_as_the_name_that_it_replaces_is_told_of(part, excitation, seed, tmp_path, monkeypatch):
+def test_a_law_as_small_as_the_name_that_it_replaces_is_told_of(part, excitation, duration, seed, tmp_path, monkeypatch):
     """It lies below the noise, as the name does, and is held to be as small; seed 3 was nothing, others a constant load."""
     law = functools.partial(uneven_gain, part=part)
-    findings = analysed(record(tmp_path / "run", law, seed, monkeypatch, excitation, 30.0)).findings
+    findings = analysed(record(tmp_path / "run", law, seed, monkeypatch, excitation, duration)).findings
     assert (findings.verdict, findings.effects) == ("unexplained", ())
     [unknown] = findings.unknown
     assert (unknown.channel, unknown.depends_on) == ("drive_torque/front_left", ("drive_torque/front_left",))

@@ -274,7 +274,7 @@ class _TermMaker:
             is_exact=not isinstance(effect, ClockEffect) or self.exact_clocks,
             is_curved=not (isinstance(effect, ClockEffect) and self.exact_clocks),
             resolution=chosen.resolution,
-            blur=self._between_samples() if look == "windows" else {},
+            blur=self._blur_of_times() if look == "windows" else {},
             settled=_heights(effect) if {"x", "y"} == set(chosen.resolution) else {},
             grid_size=chosen.among,
             turning=turning is not None,
@@ -285,7 +285,7 @@ class _TermMaker:
             recording=recording,
         )
 
-    def _between_samples(self) -> dict[str, float]:
+    def _blur_of_times(self) -> dict[str, float]:
         """Standard deviations [s] of when something begins, and how long it lasts, of which samples are all that is known.
 
         Simulators begin it with a step of theirs, and stamps of a real robot say when a sample was sent: without this an
