@@ -7,6 +7,7 @@ import pytest
 
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.gathered_terms import gatherings
@@ -72,3 +73,26 @@ def test_casters_that_scrub_alike_are_one_fault_of_all_also_where_each_was_found
     each = search.settle_on(search.conclude([Instance(k, (), (0,)) for k in single], threshold), threshold)
     assert len(each.fit.instances) == robot.n
     assert len(search.gathered(each).fit.instances) == found
+
+
+@pytest.mark.parametrize("loaded", [True, False])
+def test_weak_drives_and_steerings_are_a_payload_unless_the_recording_objects(loaded):
+    """Torques too small by one factor are masses too large by it; two effects with strained numbers may fit better."""
+    robot = load_robot("thesis")
+    effects = [EffectInstance("payload_mass", ("chassis",), {"mass": 18.0, "x": -0.15, "y": -0.01, "z": 0.5})]
+    if not loaded:
+        effects = [EffectInstance("torque_constant_error", robot.caster_names, {"error": -0.2}, axis) for axis in AXIS_NAMES]
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "identification", 12.0, 3), effects)
+    problem = RobotProblemBuilder(robot, [recording]).build()
+    weak = [
+        k for k, term in enumerate(problem.terms)
+        if term.effect == "torque_constant_error" and len(term.target) == robot.n
+    ]  # fmt: skip
+    search = EffectSearch(problem, np.random.default_rng(0))
+    threshold = search.settings.smallest_threshold
+    both = search.conclude(search.made_exact(tuple(Instance(k, (), (0,)) for k in weak)), threshold)
+    found = search.with_one_cause(both)
+    names = [problem.terms[instance.term].effect for instance in found.fit.instances]
+    assert names == (["payload_mass"] if loaded else ["torque_constant_error"] * 2)
+    if loaded:
+        assert found.fit.mean[-1] == pytest.approx(18.0, rel=0.05)

@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -42,6 +43,8 @@ FAR_MOVED = 2.0
 LEAST_STAND_IN = 30.0
 # Waves of a floor are tried anew beside what was found: these lengths [m], and so many directions; the best few are refined.
 WAVELENGTHS, WAVE_DIRECTIONS, WAVE_STARTS = np.geomspace(0.3, 4.0, 10), 12, 3
+# Log odds, at most, of torques that are off at all drives and steerings, once they have given way to one cause in the chassis.
+LEAST_DOUBT = -1.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # So often the outline of a patch is searched, each time from where the last one was made exact.
@@ -89,6 +92,8 @@ class EffectSearch(SetGrowth):
         self.taken_over: dict[tuple[int, int], float] = {}
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
         self.noise_gain = (0.0, 1.0)
+        # The problem, and where it is exact, before any effect was named.
+        self.unexplained = (self.problem, self._point)
 
     def run(self) -> Selection:
         """Grow, calibrate, prune, settle, and drop what re-tuning does as well."""
@@ -109,6 +114,7 @@ class EffectSearch(SetGrowth):
             self.description, self.problem = self.description.with_headings(changes), self.problem.with_headings(changes)
         # Of all numbers this one moves far in healthy robots, and what every torque does hangs on it.
         self.problem = self.problem.with_soft_tyres()
+        self.unexplained = self.problem, self._point
         instances = self.over_complete()
         regression = self.whiten_beside(instances)
         for _ in range(3):
@@ -121,6 +127,7 @@ class EffectSearch(SetGrowth):
         threshold = self.calibrate(regression, instances)
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
         selection = self.against_alike(self.against_fewer(self.with_best_waves(self.gathered(selection))))
+        selection = self.with_one_cause(selection)
         return self.with_outlines(self.bounded(self.retuned_away(selection)))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
@@ -244,6 +251,50 @@ class EffectSearch(SetGrowth):
             fewer = (*fewer, max(rest, key=lambda instance: regression.fit((*fewer, instance)).log_evidence))
         self.problem, self._point = here
         return selection
+
+    def with_one_cause(self, selection: Selection) -> Selection:
+        """Exchange what is off at all drives and all steerings for one cause in the chassis, unless the recordings object.
+
+        Torques too small by one factor are masses too large by it. What tells the two apart is little beside what the model
+        errs by itself, and two effects with strained numbers may fit that better than the one that is there.
+        """
+        terms = self.problem.terms
+        for first, second in itertools.combinations(selection.fit.instances, 2):
+            one, other = terms[first.term], terms[second.term]
+            if one.effect != other.effect or one.target != other.target or one.axis == other.axis or len(one.target) < 2:
+                continue
+            others = tuple(i for i in selection.fit.instances if i not in (first, second))
+            alike = [name for name in all_effects()[one.effect].look_alikes if all_effects()[name].target_kind == "chassis"]
+            for rival in (k for k, term in enumerate(terms) if term.effect in alike):
+                instead, odds = self._with_rival(selection, others, rival)
+                if instead is not selection:
+                    self.where_exact[rival, first.term] = min(-odds, LEAST_DOUBT)
+                    return instead
+        return selection
+
+    def _with_rival(self, selection: Selection, others: tuple[Instance, ...], rival: int) -> tuple[Selection, float]:
+        """A smaller set with another term, from where nothing was named on, and its log odds, unless these are too low."""
+        here = self.problem, self._point
+        self.problem, self._point = self.unexplained
+        regression = self.whiten_beside(others)
+        candidates = regression.scan(others, only=[rival])[0]
+        if candidates and math.isfinite(candidates[0].gain):
+            chosen = self.made_exact((*others, refined_shape(regression, others, candidates[0].instance)))
+            instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)
+            there, odds = (self.problem, self._point), 0.0
+            # Which of the two leaves noise alone nobody knows: by that of either in turn.
+            for noise in (selection.regression, instead.regression):
+                self.problem, self._point = here
+                own, own_left = self._reached_with(noise, selection.fit.instances)
+                self.problem, self._point = there
+                evidence, left = self._reached_with(noise, instead.fit.instances)
+                odds += 0.5 * noise.odds(evidence - own, own_left, left)
+            said = " and ".join(map(self.label, instead.fit.instances))
+            self.progress(f"{said} instead, from the beginning: log odds {odds:.1f}")
+            if odds > -selection.threshold and any(found.term == rival for found in instead.fit.instances):
+                return instead, odds
+        self.problem, self._point = here
+        return selection, -math.inf
 
     def against_alike(self, selection: Selection) -> Selection:
         """Exchange an effect for one that does the same to first order, where that one does more when both are exact."""

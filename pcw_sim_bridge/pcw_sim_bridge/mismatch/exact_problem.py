@@ -193,6 +193,11 @@ class ExactProblem:
         """Log evidence of a set where it is exact, and its columns with it: what is reached there, not what is promised."""
         return self._reached(regression, fit)[0]
 
+    def _reached_with(self, noise: WhitenedRegression, instances: tuple[Instance, ...]) -> tuple[float, FloatArray]:
+        """As `_reached`, of a set where the problem is exact now, by the noise of another regression."""
+        regression = noise.moved(self.problem)
+        return self._reached(regression, regression.fit(instances))
+
     def _reached(self, regression: WhitenedRegression, fit: Fit) -> tuple[float, FloatArray]:
         """The same, and the whitened residual there."""
         here, reached, left = (self.problem, self._point), -math.inf, regression.whitened_residual(fit)
