@@ -46,7 +46,10 @@ def test_leads_are_found_where_first_orders_say_nothing_of_them(tmp_path: Path, 
 
 @pytest.mark.parametrize(
     ("inertial", "tracked", "more"),
-    [(0.15, 0.0, ()), (0.0, -0.2, ({"name": "drive_coulomb_friction", "target": ["front_left"], "coulomb": 0.5},))],
+    [
+        pytest.param(0.15, 0.0, (), marks=pytest.mark.nightly),
+        (0.0, -0.2, ({"name": "drive_coulomb_friction", "target": ["front_left"], "coulomb": 0.5},)),
+    ],
 )
 def test_a_clock_far_off_is_named_with_its_lead_and_explains_all(
     tmp_path: Path, inertial: float, tracked: float, more: tuple[dict[str, object], ...]

@@ -111,7 +111,10 @@ def test_after_the_suggested_manoeuvre_one_is_named_without_the_other(
     assert second not in findings.effects[0].ambiguous_with
 
 
-@pytest.mark.parametrize(("name", "arm"), [("steps", 2e-3), ("chirp_x", 2e-3), ("strafe", 5e-4)])
+@pytest.mark.parametrize(
+    ("name", "arm"),
+    [("steps", 2e-3), *(pytest.param(*which, marks=pytest.mark.nightly) for which in (("chirp_x", 2e-3), ("strafe", 5e-4)))],
+)
 def test_what_is_foretold_is_about_what_a_recording_gives(name: str, arm: float) -> None:
     """The evidence between the two sets in a simulated recording, against its expectation: within a factor of two.
 

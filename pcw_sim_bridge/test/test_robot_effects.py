@@ -26,7 +26,7 @@ CONCEALED = [
     ("pybullet", {"name": "wheel_radius_error", "target": ["front_left"], "error": 1.0e-3}),
     pytest.param("reduced", {"name": "wheel_radius_error", "target": [*THESIS.caster_names], "error": 1.5e-3}, marks=NIGHTLY),
     pytest.param("pybullet", {"name": "steer_zero_offset", "target": ["front_right"], "offset": 0.03}, marks=NIGHTLY),
-    ("reduced", {"name": "caster_offset_error", "target": ["rear_left"], "x": 3e-3}),
+    pytest.param("reduced", {"name": "caster_offset_error", "target": ["rear_left"], "x": 3e-3}, marks=NIGHTLY),
     pytest.param("reduced", {"name": "imu_bias", "target": ["imu"], "gyro": 0.03}, marks=NIGHTLY),
     pytest.param("pybullet", {"name": "imu_scale", "target": ["imu"], "gyro": 0.05}, marks=NIGHTLY),
     pytest.param("pybullet", {"name": "imu_lever_arm", "target": ["imu"], "x": 0.08}, marks=NIGHTLY),

@@ -127,7 +127,7 @@ def test_errors_of_torques_are_told_by_the_balance_of_forces(tmp_path: Path) -> 
     assert error(by_reports.balanced_torque) < 0.7 * error(by_reports.quiet_torque)
 
 
-@pytest.mark.parametrize("excitation", ["figure8", "identification"])
+@pytest.mark.parametrize("excitation", [pytest.param("figure8", marks=pytest.mark.nightly), "identification"])
 def test_a_healthy_robot_whose_drives_hold_speeds_lacks_nothing(tmp_path: Path, excitation: str) -> None:
     """Torques read once a cycle, always before the next command: less than what was given by a part of what accelerates."""
     findings = found_in(run(FLOW_BASE, "velocity_loops", tmp_path, excitation, 40.0))
@@ -180,7 +180,11 @@ def test_no_factor_of_all_torques_and_masses_takes_errors_away(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("name", "controller", "mass"), [("flow_base", "velocity_loops", 5.0), ("tidybot2", "computed_torque", 15.0)]
+    ("name", "controller", "mass"),
+    [
+        pytest.param("flow_base", "velocity_loops", 5.0, marks=pytest.mark.nightly),
+        ("tidybot2", "computed_torque", 15.0),
+    ],
 )
 def test_a_payload_is_no_weakness_of_all_motors(tmp_path: Path, name: str, controller: str, mass: float) -> None:
     """A fit that makes all torques and masses smaller makes all errors smaller, too, and would be preferred for that."""

@@ -222,7 +222,7 @@ def test_a_motor_that_is_much_weaker_one_way_is_no_gear_friction(tmp_path, monke
     ("part", "excitation", "duration", "seed"),
     [
         pytest.param(0.02, "identification", 25.0, 3, marks=pytest.mark.nightly),
-        (0.02, "identification", 25.0, 4),
+        pytest.param(0.02, "identification", 25.0, 4, marks=pytest.mark.nightly),
         # Looked at sample by sample it is one of many laws that noise makes look better.
         (0.014, "chirps", 30.0, 6),
     ],
@@ -251,7 +251,7 @@ def test_a_quadratic_drag_is_no_viscous_friction_beside_it(excitation, seed, tmp
     assert unknown.depends_on == ("steer_velocity/front_right",)
 
 
-@pytest.mark.parametrize("size", [0.005, 0.002])
+@pytest.mark.parametrize("size", [pytest.param(0.005, marks=pytest.mark.nightly), 0.002])
 def test_a_small_drag_of_all_steerings_is_no_viscous_friction(tmp_path, monkeypatch, size):
     """It is a fair part of the friction that looks most like it, though not of what is measured.
 
