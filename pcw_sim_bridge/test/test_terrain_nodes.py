@@ -32,11 +32,12 @@ class SlippingDriver:
 
     def __init__(self, ros, slips=True):
         self.slips, self.count, self.reading, self.observed, self.ready = slips, 0, None, None, False
-        self.publisher = ros.peer.create_publisher(JointState, "joint_commands", 10)
         ros.peer.create_subscription(JointState, "joint_states", self._read, 1000)
         ros.peer.create_subscription(JointState, "slip/observer", self._hear, 1000)
         ros.peer.create_subscription(JointState, "terrain/grip", self._terrain_is_there, 1)
         ros.peer.create_timer(0.5, self._answer_anyway)
+        # Last: the bridge begins when somebody commands and somebody, not always this, hears.
+        self.publisher = ros.peer.create_publisher(JointState, "joint_commands", 10)
 
     def _terrain_is_there(self, _):
         self.ready = True
@@ -87,7 +88,7 @@ def nodes(tmp_path):
         ros.start("pcw_terrain.nodes.terrain")
         ros.start(
             "pcw_sim_bridge.nodes.bridge", "-p", f"robot:={tmp_path / 'real.yaml'}", "-p", "lockstep:=true",
-            # The first joint_states may come before this test is known to the bridge, which other nodes hear already.
+            # Should the first joint_states reach the other nodes alone all the same.
             "-p", "real_time_factor:=1.0", "-p", "lockstep_timeout:=3.0",
         )  # fmt: skip
         yield ros
