@@ -8,6 +8,7 @@
    blocks, or that moves no channel by a fair part of what is left of it. Exchange terms where another one does better.
 4. Settle: make the problem exact at what is left, ask whether something that was dropped is missing now, and prune again.
 5. Ask whether fewer effects do as well from the description on, and whether one that looks like an effect does more.
+   What is off at all drives and all steerings gives way to one cause in the chassis, unless the recordings object.
 6. Ask of every effect whose work re-tuned numbers could do whether they do it as well once the problem is exact at those.
 7. Search the outlines of patches of floor.
 """
@@ -43,8 +44,8 @@ FAR_MOVED = 2.0
 LEAST_STAND_IN = 30.0
 # Waves of a floor are tried anew beside what was found: these lengths [m], and so many directions; the best few are refined.
 WAVELENGTHS, WAVE_DIRECTIONS, WAVE_STARTS = np.geomspace(0.3, 4.0, 10), 12, 3
-# Log odds, at most, of torques that are off at all drives and steerings, once they have given way to one cause in the chassis.
-LEAST_DOUBT = -1.0
+# What is off at all drives and all steerings and gave way to one cause in the chassis has at most these log odds against it.
+REPLACED_ODDS = -1.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
 # So often the outline of a patch is searched, each time from where the last one was made exact.
@@ -268,7 +269,7 @@ class EffectSearch(SetGrowth):
             for rival in (k for k, term in enumerate(terms) if term.effect in alike):
                 instead, odds = self._with_rival(selection, others, rival)
                 if instead is not selection:
-                    self.where_exact[rival, first.term] = min(-odds, LEAST_DOUBT)
+                    self.where_exact[rival, first.term] = min(-odds, REPLACED_ODDS)
                     return instead
         return selection
 
