@@ -95,10 +95,14 @@ def test_it_says_what_departs_and_where_and_keeps_it(sent: list[RawMessage], cal
         robot = Robot(ros, after(sent, FAULT_TIME - 6.0))
         ros.wait_for(lambda: mismatch, while_doing=robot.send, every=0.03)
         told = f"looks most like {THESIS.caster_names[0]}: friction in the drive"
-        [summary, *_] = ros.wait_for(
-            lambda: [s for s in statuses(diagnostics, "mismatch") if told in s.message], while_doing=robot.send, every=0.03
-        )
-        assert summary.level == DiagnosticStatus.ERROR and "departs by" in summary.message
+
+        def suspected() -> list[DiagnosticStatus]:
+            # Where messages were lost or the robot has stopped sending, a later report may only warn of what departed.
+            errors = [s for s in statuses(diagnostics, "mismatch") if s.level == DiagnosticStatus.ERROR]
+            return [s for s in errors if told in s.message]
+
+        [summary, *_] = ros.wait_for(suspected, while_doing=robot.send, every=0.03)
+        assert "departs by" in summary.message
         values = {entry.key: entry.value for entry in summary.values}
         assert float(values["rate of joint_states [Hz]"]) > 100.0 and values["missing"] == "none"
         assert float(values["share_of_core"]) > 0.0

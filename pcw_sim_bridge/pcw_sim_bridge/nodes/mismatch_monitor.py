@@ -134,7 +134,7 @@ class MismatchMonitorNode(Node):
     def _judge(self) -> None:
         if self._fresh:
             self._fresh = False
-            before = Level.OK if self._judgement is None else self._judgement.level
+            before = _news(self._judgement)
             self._judgement = judgement = self._live.update()
             for problem in judgement.problems:
                 self._problems.add(problem)
@@ -143,7 +143,7 @@ class MismatchMonitorNode(Node):
                 self._publisher.publish(mismatch_message(judgement.channels, judgement.stamp))
             if judgement.ready and not self._saved:
                 self._save()
-            if judgement.level is not before:
+            if _news(judgement) != before:
                 self._diagnostics.report()
         self._keep()
 
@@ -208,6 +208,11 @@ class MismatchMonitorNode(Node):
         if self._departed:
             return Status(WARN, f"nothing to judge now; before: {self._departed}", values)
         return Status(OK, "standing still, or nothing to judge", values)
+
+
+def _news(judgement: Judgement | None) -> tuple[Level, bool]:
+    """What is said at once when it changes, and not only when the next report is due."""
+    return (Level.OK, False) if judgement is None else (judgement.level, judgement.suspect is not None)
 
 
 def main(args: Sequence[str] | None = None) -> int:
