@@ -114,6 +114,12 @@ def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object
     else:
         assert np.hypot(values["x"] - 0.5, values["y"] - 0.3) < 0.15
         assert values["factor"] == pytest.approx(0.3, rel=0.2)
+        recording = Recording.open(tmp_path / "run", THESIS)
+        builder = RobotProblemBuilder(THESIS, [recording])
+        problem = builder.build(with_terms=False)
+        inside = np.linalg.norm((problem.wheel_places - [0.5, 0.3]) / [0.3, 0.2], axis=2) < 1.0
+        [place] = [location for location in findings.locations if location.place is not None]
+        assert place.intervals[0][0] == pytest.approx(problem.time[inside.any(axis=1)][0], abs=0.1)
 
 
 def test_other_waves_are_asked_beside_what_was_found(tmp_path: Path) -> None:

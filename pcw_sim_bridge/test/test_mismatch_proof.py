@@ -81,12 +81,9 @@ def test_windows_rolled_out_together_are_those_stepped_one_by_one() -> None:
     position, velocity = rng.uniform(-1.0, 1.0, (2, windows, robot.n, 2))
     twist, pose, time = rng.uniform(-0.3, 0.3, (windows, 3)), rng.uniform(-1.0, 1.0, (windows, 3)), np.array([0.0, 3.0, 7.0])
 
-    def twice(values: np.ndarray) -> np.ndarray:
-        return np.stack([values, values], axis=1)
-
     plant = ReducedPlant(robot)
-    starts = WindowStarts(time, twice(pose), twice(twist), twice(position), twice(velocity))
-    bodies, joints = plant.roll_out(torque, steps, starts, 0, marks)
+    starts = WindowStarts(np.array([0]), time, *(values[:, None] for values in (pose, twist, position, velocity)))
+    bodies, joints = plant.roll_out(torque, steps, starts, marks)
     for w in range(windows):
         plant.reset(pose=pose[w])
         plant.set_motion(twist[w], position[w], velocity[w])
@@ -133,6 +130,25 @@ def test_the_right_robot_rolls_out_to_the_noise_and_the_nominal_one_does_not(
     assert (right[1] < 0.1 * error[1]).all()
     assert (right[1] < 4.0 * floor[1]).all()
     assert (floor[1] < 4.0 * right[1]).all()
+
+
+def test_soft_tyres_have_taken_up_their_forces_where_a_window_begins(tmp_path: Path) -> None:
+    """After a tenth of a second they had not, and the true robot was further off than one with the described tyres."""
+
+    def twist(time: float) -> np.ndarray:
+        return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
+
+    soft = [physics("tyre_lateral_stiffness", caster, error=-0.8) for caster in THESIS.caster_names]
+    path = tmp_path / "run"
+    record_run(dataclasses.replace(THESIS, physics=tuple(soft)), twist, 14.0, 1, path, controlled_as=THESIS)
+    nominal = RobotSubject(THESIS)
+    windows = nominal.windows([nominal.open(path, "fit", {})])
+    assert windows is not None
+    true_robot, rng = nominal.patched(soft, {}), np.random.default_rng(0)
+    squares = nominal.rollout(windows), true_robot.rollout(windows), true_robot.rollout_floor(windows, rng)
+    error, right, floor = (np.sqrt(np.nanmean(windows.relative(s)[:, 1])) for s in squares)
+    print("nominal", error, "true", right, "floor", floor)
+    assert right < 0.5 * error and right < 1.5 * floor
 
 
 def test_some_windows_give_what_all_of_them_give(recorded: tuple[Path, EffectInstance]) -> None:
@@ -587,13 +603,31 @@ def test_a_leftover_at_one_place_is_placed_and_one_everywhere_is_not() -> None:
     assert place_of_power(path, rng.chisquare(1, 3000), np.ones(3000, dtype=bool)) is None
 
 
-def located(effect: str, target: str, contribution: np.ndarray, **shape: float) -> LocationFinding:
+def located(
+    effect: str, target: str, contribution: np.ndarray, wheel_places: np.ndarray | None = None, **shape: float
+) -> LocationFinding:
     """Where an effect of known shape is found that adds `contribution` (T,) to one channel of unit noise, 20 Hz."""
     problem = problem_of({"speed": np.linspace(0.0, 1.0, len(contribution))}, 20.0)
+    problem = dataclasses.replace(problem, wheel_places=wheel_places)
     term = Term(effect, (target,), (), ({},), lambda _: np.zeros((len(contribution), 1, 0)), ("speed",))
     named = NamedTerm(Instance(0, tuple(shape.items()), ()), term, {}, 1.0, (), 20.0, 10.0, contribution[:, None])
     explanation = SimpleNamespace(search=SimpleNamespace(problem=problem), floor=np.ones(1))
     return locate(explanation, named)  # type: ignore[arg-type]
+
+
+def test_a_patch_is_at_work_while_a_wheel_is_on_it() -> None:
+    """The filter of the channels begins to show it before: it was said to begin a third of a second too early."""
+    contribution = np.zeros(600)
+    contribution[230:310] = 5.0
+    crossing = np.stack([np.linspace(0.0, 3.0, 600), np.full(600, -0.4)], axis=1)
+    far = np.full((600, 2), 9.0)
+    patch = {"factor": 0.3, "x": 1.5, "y": -0.4, "length": 0.8, "width": 0.4, "roundness": 0.0}
+    slipped = located("low_friction_patch", "rear_left", contribution, np.stack([far, crossing], axis=1), **patch)
+    [(start, stop)] = slipped.intervals
+    assert (start, stop) == pytest.approx((1.1 * 599 / 3.0 / 20.0, 1.9 * 599 / 3.0 / 20.0), abs=0.1)
+    # Where the wheels never were on it, as far as their places are known, the channels tell.
+    missed = located("low_friction_patch", "rear_left", contribution, np.stack([far, far], axis=1), **patch)
+    assert missed.intervals == ((230 / 20.0, 309 / 20.0),)
 
 
 def test_a_push_is_located_by_its_own_start_and_a_patch_by_its_place() -> None:

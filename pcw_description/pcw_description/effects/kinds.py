@@ -160,6 +160,17 @@ class ContactEffect(Effect):
 
     contact: Callable[..., None] = dataclasses.field(default=lambda *_: None, repr=False)
 
+    def is_at(self, places: FloatArray, parameters: Values) -> np.ndarray:
+        """Whether a wheel at places (..., 2) [m] of the world finds it there: (...) of bool."""
+        flat = places.reshape(-1, 2)
+        at, found = np.zeros((len(flat), CONTACT_INPUTS)), np.zeros((len(flat), CONTACT_RESULTS))
+        at[:, CONTACT_X : CONTACT_Y + 1] = flat
+        found[:, FRICTION] = 1.0
+        array_kernel_along(self.contact, at, self.values(parameters), found)
+        found[:, FRICTION] -= 1.0
+        there: np.ndarray = np.any(found != 0.0, axis=1).reshape(places.shape[:-1])
+        return there
+
 
 @dataclasses.dataclass(frozen=True)
 class ChassisForceEffect(Effect):

@@ -83,12 +83,15 @@ def locate_leftover(explanation: Explanation, leftover: Leftover, path: FloatArr
 def _intervals_of(
     explanation: Explanation, named: NamedTerm, values: dict[str, float], at_work: BoolArray
 ) -> tuple[tuple[float, float], ...]:
-    """By the effect's own start and duration; on a place, while it is there; else as long as the recording supports it."""
+    """By the effect's own start and duration; while a wheel is on its place; else as long as the recording supports it."""
     problem, effect = explanation.search.problem, get(named.term.effect)
     if "start" in values and "duration" in values:
         return ((values["start"], values["start"] + values["duration"]),)
-    if isinstance(effect, ContactEffect) and {"x", "y"} <= set(values):
-        return intervals(problem, at_work)
+    if isinstance(effect, ContactEffect) and _place_of(effect, values) is not None:
+        # What the channels show of it begins earlier, as they are filtered, or later, where the wheel does not slip yet.
+        wheels = problem.wheel_places
+        on_it: BoolArray = np.zeros_like(at_work) if wheels is None else np.any(effect.is_at(wheels, values), axis=1)
+        return intervals(problem, on_it if on_it.any() else at_work)
     shown = np.flatnonzero(np.any(np.abs(named.contribution) > 0.0, axis=1))
     first = problem.recording[shown[0]] if len(shown) else 0
     own = np.flatnonzero(problem.recording == first)

@@ -288,6 +288,7 @@ class RegressionProblem:
             known no better, and an effect that is no larger and looks alike is not told from it.
         drifts: columns (T, C, K) of the model's own errors, which may vary slowly; None: no effect looks otherwise than these.
         sites: where an unknown torque or force may act; None where nothing measured would show it.
+        wheel_places: of the wheels in the world (T, n, 2) [m]; None where nothing rolls.
         exact: (changes of nuisances by name, sizes of effects) -> residual (T, C) of the model with all of them at work, and
             the names of the nuisances that it holds; None from it where there is no such model, and instead of it where the
             columns are exact everywhere.
@@ -317,6 +318,7 @@ class RegressionProblem:
     scale_deviation: float = 0.0
     drifts: FloatArray | None = None
     sites: Sites | None = None
+    wheel_places: FloatArray | None = None
     exact: Callable[[Mapping[str, float], Sequence[SizedTerm]], tuple[FloatArray, Sequence[str]] | None] | None = None
     derive: Callable[[Mapping[str, float], Sequence[SizedTerm]], Mapping[str, FloatArray] | None] | None = None
     softened: Callable[[Mapping[str, float]], tuple[FloatArray, Sequence[str]]] | None = None

@@ -137,10 +137,11 @@ class RobotProblemBuilder:
         recording = np.array([motion.recording for motion in self.motions])[segment]
         rate = float(np.mean([f.decimated_rate for f in self.filters]))
         terms: tuple[Term, ...] = ()
+        places, headings = self._wheels()
         if with_terms:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
-            looked = Looked(left, deviation, valid, time, recording, rate, angle, *self._wheels())
+            looked = Looked(left, deviation, valid, time, recording, rate, angle, places, headings)
             terms = tuple(robot_terms(self.robot, differences, looked, bool(self._leads.any())))
         exact = functools.partial(self._exact, differences, terms)
         residual, nominal = differences.residual, None
@@ -163,6 +164,7 @@ class RobotProblemBuilder:
             scale_deviation=self._scale_deviation(),
             drifts=_drifts(terms) if self.layout.balanced else None,
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
+            wheel_places=places,
             exact=exact,
             derive=functools.partial(self._derive, differences, terms),
             softened=self._softened if self.layout.balanced else None,

@@ -24,7 +24,10 @@ from .signal_filter import SignalFilter, derivative, white_noise_level
 
 SIGNALS = ("v_x", "v_y", "omega", "drive_velocity", "steer_velocity", "x", "y", "yaw")
 STEP = 1e-3  # [s], at most
-LEAD = 0.1  # [s] in which tyres take up their forces and actuators fill their memories
+# Before a window begins, tyres take up their forces and actuators fill their memories for so long [s]: soft tyres, and such
+# that have to roll for their forces, need some tenths of a second. By then joints would be elsewhere than they were measured.
+LEAD = 0.5
+SETTINGS = 5  # times in the lead that the motion is set as it was measured
 CUTOFF_SHARE = 8.0  # sampling rate over the largest cut-off; motions and torques shall be as sharp as they can be
 NOISE_SAMPLES = 8000  # of a signal that its noise is taken from
 
@@ -218,15 +221,16 @@ def _simulated(robot: RobotDescription, part: RobotPart, unreported: FloatArray)
     plant = ReducedPlant(dataclasses.replace(robot, physics=behind), 1.0 / (motion.rate * substeps))
     lead, last = part.lead, part.marks[-1]
     rows, _ = rows_of(part.starts - lead, np.arange(lead + last), len(motion.time))
-    first = np.stack([part.starts - lead, part.starts], axis=1)
+    set_at = np.round(np.linspace(0, lead, SETTINGS + 1)).astype(np.int64)
+    first = part.starts[:, None] - lead + set_at
     twist = wheel_twist(own, motion.position[..., STEER], motion.velocity)
     starts = WindowStarts(
-        motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first]
+        set_at, motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first]
     )
     # A row is held until the next: what acts meanwhile is the mean of both.
     given = motion.torque + np.sum(unreported * motion.loops, axis=3)
     torque = 0.5 * (given[rows] + given[np.minimum(rows + 1, len(motion.time) - 1)])
-    bodies, joints = plant.roll_out(torque, substeps, starts, lead, part.marks)
+    bodies, joints = plant.roll_out(torque, substeps, starts, [lead + mark for mark in part.marks])
     position, velocity = _read(robot, joints[..., 0, :], joints[..., 1, :])
     return _signals(part, position, velocity, bodies[..., :3])
 

@@ -40,6 +40,7 @@ from pcw_description.effects.kinds import (
     RADIUS_CHANGE,
     RADIUS_SLOPE,
 )
+from pcw_description.recording_series import IntArray
 from pcw_description.robot_description import FloatArray, RobotDescription
 from pcw_description.support_forces import support_forces
 
@@ -335,7 +336,7 @@ def _rigid_motors(effects, position, velocity):  # type: ignore[no-untyped-def]
 
 @compiled
 def _roll_out(  # type: ignore[no-untyped-def]
-    steps, dt, chassis, casters, gravity, effects, torque, lead, marks, time, pose, twist, position, velocity, bodies, joints
+    steps, dt, chassis, casters, gravity, effects, torque, marks, set_at, time, pose, twist, position, velocity, bodies, joints
 ):
     """Fill bodies (W, K, 6) and joints (W, K, n, 4) of `ReducedPlant.roll_out`; False if a torque is not finite."""
     windows, rows, n, _ = torque.shape
@@ -350,21 +351,22 @@ def _roll_out(  # type: ignore[no-untyped-def]
         body[_X : _YAW + 1] = pose[w, 0]
         body[_TIME] = time[w]
         _set_motion(body, wheels, effects, twist[w, 0], position[w, 0], velocity[w, 0])
-        mark = 0
+        mark, setting = 0, 1
         for row in range(rows + 1):
-            if row == lead and lead > 0:
+            if setting < len(set_at) and row == set_at[setting]:
                 rolled, _, _ = forward_kinematics_kernel(
                     axis, offset, radius, wheels[:, PHI].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
                 )
-                restart[:] = twist[w, 1] + body[_VX : _OMEGA + 1] - rolled
-                body[_X : _YAW + 1] = pose[w, 1]
+                restart[:] = twist[w, setting] + body[_VX : _OMEGA + 1] - rolled
+                body[_X : _YAW + 1] = pose[w, setting]
                 # Gears stay wound up as the lead left them.
                 wound = effects.gear_state[:, :, : RATE + 1].copy()
                 _rigid_motors(effects, wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy())
                 wound -= effects.gear_state[:, :, : RATE + 1]
-                _set_motion(body, wheels, effects, restart, position[w, 1], velocity[w, 1])
+                _set_motion(body, wheels, effects, restart, position[w, setting], velocity[w, setting])
                 effects.gear_state[:, :, : RATE + 1] += wound
-            if mark < len(marks) and row == lead + marks[mark]:
+                setting += 1
+            if mark < len(marks) and row == marks[mark]:
                 bodies[w, mark] = body[: _OMEGA + 1]
                 joints[w, mark, :, :2] = as_joint_motion(
                     effects.gears, effects.coupling, effects.gear_state[:, :, ANGLE], wheels[:, RHO : PHI + 1]
@@ -382,15 +384,17 @@ def _roll_out(  # type: ignore[no-untyped-def]
 
 @dataclasses.dataclass(frozen=True)
 class WindowStarts:
-    """How the windows of a roll-out begin: W of them, each given at its first row [0] and where its lead ends [1].
+    """How the windows of a roll-out begin: W of them, the motion of each given A times, the first with its first row.
 
     Attributes:
+        rows: after the first at which the motion is set (A,), increasing, the first 0.
         time: of the first row (W,) [s].
-        pose: (W, 2, 3) of base_link in the world.
-        twist: (W, 2, 3) of base_link as its rolling wheels have it.
-        position, velocity: of the joints (W, 2, n, 2).
+        pose: (W, A, 3) of base_link in the world.
+        twist: (W, A, 3) of base_link as its rolling wheels have it.
+        position, velocity: of the joints (W, A, n, 2).
     """
 
+    rows: IntArray
     time: FloatArray
     pose: FloatArray
     twist: FloatArray
@@ -486,19 +490,18 @@ class ReducedPlant:
         )
 
     def roll_out(
-        self, torque: FloatArray, steps: int, starts: WindowStarts, lead: int, marks: Sequence[int]
+        self, torque: FloatArray, steps: int, starts: WindowStarts, marks: Sequence[int]
     ) -> tuple[FloatArray, FloatArray]:
         """Drive many short windows with recorded torques, compiled as one; the plant is at its reset state afterwards.
 
-        Over the first `lead` rows tyres take up their forces and actuators fill their memories. Then the motion is set
-        again, and what the wheels slipped by is kept.
+        Where the motion is set again, what the wheels slipped by is kept: until then tyres take up their forces and
+        actuators fill their memories.
 
         Args:
             torque: motor torques (W, L, n, 2) [N m], each row held for `steps` steps.
             steps: steps of dt per row.
             starts: of the windows.
-            lead: rows.
-            marks: rows after the lead at which the state is wanted (K,), increasing, at most L - lead.
+            marks: rows after the first at which the state is wanted (K,), increasing, at most L.
 
         Returns:
             Pose and twist (W, K, 6), and what encoders on the motors would read: joint positions and velocities
@@ -511,7 +514,7 @@ class ReducedPlant:
         bodies, joints = np.full((windows, len(marks), 6), np.nan), np.full((windows, len(marks), n, 4), np.nan)
         fine = _roll_out(
             steps, self.dt, self._chassis, self._casters, self._effects.gravity, self._effects.compiled,
-            np.ascontiguousarray(torque), lead, np.array(marks, dtype=np.int64), starts.time, starts.pose, starts.twist,
+            np.ascontiguousarray(torque), np.array(marks, dtype=np.int64), starts.rows, starts.time, starts.pose, starts.twist,
             starts.position, starts.velocity, bodies, joints,
         )  # fmt: skip
         self.reset()
