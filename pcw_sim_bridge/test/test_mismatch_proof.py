@@ -132,6 +132,19 @@ def test_the_right_robot_rolls_out_to_the_noise_and_the_nominal_one_does_not(
     assert (floor[1] < 4.0 * right[1]).all()
 
 
+def test_torques_act_when_the_fit_says_that_they_did(recorded: tuple[Path, EffectInstance]) -> None:
+    """They are reported at the end of the period over which they were held: half of it later than they acted, on average."""
+    path, friction = recorded
+    nominal = RobotSubject(THESIS)
+    windows = nominal.windows([nominal.open(path, "fit", {})])
+    assert windows is not None
+    late, as_reported, early = (
+        np.sqrt(np.nanmean(windows.relative(nominal.patched([friction], {"torque_lag": lag}).rollout(windows))[:, 1:]))
+        for lag in (1e-3, 0.0, -1e-3)
+    )
+    assert late < 0.95 * as_reported < 0.95 * 0.9 * early, (late, as_reported, early)
+
+
 def test_soft_tyres_have_taken_up_their_forces_where_a_window_begins(tmp_path: Path) -> None:
     """After a tenth of a second they had not, and the true robot was further off than one with the described tyres."""
 

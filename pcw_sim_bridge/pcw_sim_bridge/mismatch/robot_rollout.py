@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -60,6 +60,30 @@ class RobotPart:
     def ends(self) -> tuple[IntArray, FloatArray]:
         """Rows at the horizons (W, H), and 1, or NaN where the piece ends before."""
         return rows_of(self.starts, self.marks, len(self.motion.time))
+
+
+@dataclasses.dataclass(frozen=True)
+class Reporting:
+    """How the torques that were reported differ from those that acted; see `ModelNumbers`.
+
+    Attributes:
+        unreported: of the torques of drives and steerings (2, 2).
+        torque_lag: [s].
+    """
+
+    unreported: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((2, 2)))
+    torque_lag: float = 0.0
+
+    @classmethod
+    def of(cls, retuned: Mapping[str, float]) -> Reporting:
+        """By re-tuned numbers."""
+        unreported = [[retuned.get(f"torque_report.{axis}{kind}", 0.0) for kind in ("", "_behind")] for axis in AXIS_NAMES]
+        return cls(np.array(unreported), retuned.get("torque_lag", 0.0))
+
+    def torque(self, motion: RobotMotion) -> FloatArray:
+        """Torques (T, n, 2) that acted [N m]."""
+        given: FloatArray = motion.torque + self.torque_lag * motion.torque_rate
+        return given + np.sum(self.unreported * motion.loops, axis=3)
 
 
 def robot_windows(robot: RobotDescription, recordings: Sequence[Recording]) -> Windows:
@@ -161,24 +185,24 @@ def _squares(difference: FloatArray) -> FloatArray:
 # -- simulating -----------------------------------------------------------------------------------------------------
 
 
-def rollout_squares(robot: RobotDescription, windows: Windows, unreported: FloatArray) -> FloatArray:
+def rollout_squares(robot: RobotDescription, windows: Windows, reporting: Reporting) -> FloatArray:
     """Squared errors (W, H, S) of a robot's model over windows.
 
     Args:
         robot: the model.
         windows: of its recordings.
-        unreported: of the torques of its drives, see `ModelNumbers` (2, 2).
+        reporting: of these recordings.
     """
     found = []
     for part in windows.parts:
         ends, _ = part.ends()
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
-        found.append(_squares(_simulated(robot, part, unreported) - seen))
+        found.append(_squares(_simulated(robot, part, reporting) - seen))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
 def rollout_floor(
-    robot: RobotDescription, windows: Windows, unreported: FloatArray, rng: np.random.Generator
+    robot: RobotDescription, windows: Windows, reporting: Reporting, rng: np.random.Generator
 ) -> FloatArray:
     """Squared errors (W, H, S) that the noise of the sensors makes in a model that is right.
 
@@ -190,8 +214,8 @@ def rollout_floor(
         noisy, path = _with_noise(part, rng), part.path + rng.standard_normal(part.path.shape) * part.noise[2]
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
         seen_again = _signals(part, noisy.position, noisy.velocity, path)[ends]
-        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path), unreported)
-        found.append(_squares(moved - _simulated(robot, part, unreported) - (seen_again - seen)))
+        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path), reporting)
+        found.append(_squares(moved - _simulated(robot, part, reporting) - (seen_again - seen)))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
@@ -211,7 +235,7 @@ def _with_noise(part: RobotPart, rng: np.random.Generator) -> RobotMotion:
     )
 
 
-def _simulated(robot: RobotDescription, part: RobotPart, unreported: FloatArray) -> FloatArray:
+def _simulated(robot: RobotDescription, part: RobotPart, reporting: Reporting) -> FloatArray:
     """Signals (W, H, 2n + 6) that the robot's own sensors would give at the horizons."""
     motion = true_motion(robot, part.motion)
     own = ModelNumbers.of(as_it_really_is(robot))
@@ -228,7 +252,7 @@ def _simulated(robot: RobotDescription, part: RobotPart, unreported: FloatArray)
         set_at, motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first]
     )
     # A row is held until the next: what acts meanwhile is the mean of both.
-    given = motion.torque + np.sum(unreported * motion.loops, axis=3)
+    given = reporting.torque(motion)
     torque = 0.5 * (given[rows] + given[np.minimum(rows + 1, len(motion.time) - 1)])
     bodies, joints = plant.roll_out(torque, substeps, starts, [lead + mark for mark in part.marks])
     position, velocity = _read(robot, joints[..., 0, :], joints[..., 1, :])
