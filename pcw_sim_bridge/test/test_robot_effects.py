@@ -87,8 +87,8 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
         # The description's own number of this tyre takes the effect in, and comes out many tolerances off.
         ("reduced", 5, {"name": "tyre_lateral_stiffness", "target": ["rear_left"], "error": -0.5}, 0.05),
         # Two of these steerings do not turn once: no wave over their own angle can be told, but one that is there for all.
-        ("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
-                         "cosine": 0.03, "sine": -0.02}, 0.001),
+        pytest.param("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
+                                     "cosine": 0.03, "sine": -0.02}, 0.001, marks=NIGHTLY),
         # A steering that turns one way here and the other way there leaves a torque by its angle where that is not named.
         ("reduced", 1, {"name": "steer_coulomb_friction", "target": ["front_left"], "coulomb": 0.4,
                      "asymmetry": -0.15}, 0.003),

@@ -170,9 +170,12 @@ def analysed(path: Path, *held_out: Path) -> Analysis:
     [
         (friction_by_steering, "drive_torque/front_right", "steer_angle/front_right", "cos(steer_angle/front_right)"),
         (fading_torque, "drive_torque/rear_left", "time", "exp(-time /"),
-        (coupling, "drive_torque/front_left", "drive_velocity/front_left", "front_left - drive_velocity/rear_right"),
+        pytest.param(
+            coupling, "drive_torque/front_left", "drive_velocity/front_left", "front_left - drive_velocity/rear_right",
+            marks=pytest.mark.nightly,
+        ),
     ],
-)
+)  # fmt: skip
 def test_it_is_said_so_with_the_leading_variable_and_no_name(law, channel, leading, known, tmp_path, monkeypatch):
     findings = analysed(record(tmp_path / "run", law, 3, monkeypatch)).findings
     assert findings.verdict == "unexplained"
