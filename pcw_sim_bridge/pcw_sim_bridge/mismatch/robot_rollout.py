@@ -18,7 +18,7 @@ from .regression_problem import FloatArray, IntArray
 from .robot_channels import STILL_SPEED, sliding
 from .robot_effects import true_motion, with_pose
 from .robot_motion import LARGEST_CUTOFF, RobotMotion, read_motions
-from .rolling_model import ChannelLayout, ModelNumbers, twists
+from .rolling_model import ChannelLayout, ModelNumbers, twists, weights_on_steerings
 from .rollout import HORIZONS, Windows, rows_of, window_rows
 from .signal_filter import SignalFilter, derivative, white_noise_level
 
@@ -63,27 +63,35 @@ class RobotPart:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reporting:
-    """How the torques that were reported differ from those that acted; see `ModelNumbers`.
+class Undescribed:
+    """Re-tuned numbers that no description holds; see `ModelNumbers`.
 
     Attributes:
         unreported: of the torques of drives and steerings (2, 2).
         torque_lag: [s].
+        lean, detuning: of the chassis on its springs (2,) [s^2].
     """
 
     unreported: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((2, 2)))
     torque_lag: float = 0.0
+    lean: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(2))
+    detuning: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(2))
 
     @classmethod
-    def of(cls, retuned: Mapping[str, float]) -> Reporting:
-        """By re-tuned numbers."""
+    def of(cls, retuned: Mapping[str, float]) -> Undescribed:
+        """Take them from all that were re-tuned, by name."""
+        lean, detuning = ([retuned.get(f"suspension.{kind}.{axis}", 0.0) for axis in "xy"] for kind in ("lean", "detuning"))
         unreported = [[retuned.get(f"torque_report.{axis}{kind}", 0.0) for kind in ("", "_behind")] for axis in AXIS_NAMES]
-        return cls(np.array(unreported), retuned.get("torque_lag", 0.0))
+        return cls(np.array(unreported), retuned.get("torque_lag", 0.0), np.array(lean), np.array(detuning))
 
-    def torque(self, motion: RobotMotion) -> FloatArray:
-        """Torques (T, n, 2) that acted [N m]."""
-        given: FloatArray = motion.torque + self.torque_lag * motion.torque_rate
-        return given + np.sum(self.unreported * motion.loops, axis=3)
+    def torque(self, motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:
+        """Torques (T, n, 2) that acted on a robot whose chassis does not lean [N m]."""
+        given = motion.torque + self.torque_lag * motion.torque_rate + np.sum(self.unreported * motion.loops, axis=3)
+        if self.lean.any() or self.detuning.any():
+            given[:, :, STEER] += weights_on_steerings(
+                motion, dataclasses.replace(numbers, lean=self.lean, detuning=self.detuning)
+            )
+        return given
 
 
 def robot_windows(robot: RobotDescription, recordings: Sequence[Recording]) -> Windows:
@@ -185,24 +193,24 @@ def _squares(difference: FloatArray) -> FloatArray:
 # -- simulating -----------------------------------------------------------------------------------------------------
 
 
-def rollout_squares(robot: RobotDescription, windows: Windows, reporting: Reporting) -> FloatArray:
+def rollout_squares(robot: RobotDescription, windows: Windows, undescribed: Undescribed) -> FloatArray:
     """Squared errors (W, H, S) of a robot's model over windows.
 
     Args:
         robot: the model.
         windows: of its recordings.
-        reporting: of these recordings.
+        undescribed: numbers that it does not hold.
     """
     found = []
     for part in windows.parts:
         ends, _ = part.ends()
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
-        found.append(_squares(_simulated(robot, part, reporting) - seen))
+        found.append(_squares(_simulated(robot, part, undescribed) - seen))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
 def rollout_floor(
-    robot: RobotDescription, windows: Windows, reporting: Reporting, rng: np.random.Generator
+    robot: RobotDescription, windows: Windows, undescribed: Undescribed, rng: np.random.Generator
 ) -> FloatArray:
     """Squared errors (W, H, S) that the noise of the sensors makes in a model that is right.
 
@@ -214,8 +222,8 @@ def rollout_floor(
         noisy, path = _with_noise(part, rng), part.path + rng.standard_normal(part.path.shape) * part.noise[2]
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
         seen_again = _signals(part, noisy.position, noisy.velocity, path)[ends]
-        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path), reporting)
-        found.append(_squares(moved - _simulated(robot, part, reporting) - (seen_again - seen)))
+        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path), undescribed)
+        found.append(_squares(moved - _simulated(robot, part, undescribed) - (seen_again - seen)))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
@@ -235,7 +243,7 @@ def _with_noise(part: RobotPart, rng: np.random.Generator) -> RobotMotion:
     )
 
 
-def _simulated(robot: RobotDescription, part: RobotPart, reporting: Reporting) -> FloatArray:
+def _simulated(robot: RobotDescription, part: RobotPart, undescribed: Undescribed) -> FloatArray:
     """Signals (W, H, 2n + 6) that the robot's own sensors would give at the horizons."""
     motion = true_motion(robot, part.motion)
     own = ModelNumbers.of(as_it_really_is(robot))
@@ -252,7 +260,7 @@ def _simulated(robot: RobotDescription, part: RobotPart, reporting: Reporting) -
         set_at, motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first]
     )
     # A row is held until the next: what acts meanwhile is the mean of both.
-    given = reporting.torque(motion)
+    given = undescribed.torque(motion, own)
     torque = 0.5 * (given[rows] + given[np.minimum(rows + 1, len(motion.time) - 1)])
     bodies, joints = plant.roll_out(torque, substeps, starts, [lead + mark for mark in part.marks])
     position, velocity = _read(robot, joints[..., 0, :], joints[..., 1, :])

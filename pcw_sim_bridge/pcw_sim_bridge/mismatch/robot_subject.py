@@ -34,7 +34,7 @@ from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
-from .robot_rollout import Reporting, robot_windows, rollout_floor, rollout_squares
+from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
 from .subject import Opened
@@ -51,7 +51,7 @@ class RobotSubject:
         self.robot = robot
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
-        self._reporting = Reporting()
+        self._undescribed = Undescribed()
         self._missing: tuple[str, ...] = ()
         self._sensors: tuple[Path, tuple[bool, bool]] | None = None
 
@@ -146,7 +146,7 @@ class RobotSubject:
         robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
         subject = RobotSubject(retuned_robot(robot, retuned))
         subject._cutoff = self._cutoff
-        subject._reporting = Reporting.of(retuned)
+        subject._undescribed = Undescribed.of(retuned)
         return subject
 
     def mapping(self) -> dict[str, Any]:
@@ -187,11 +187,11 @@ class RobotSubject:
 
     def rollout(self, windows: Windows) -> FloatArray:
         """Return the squared errors of the reduced plant under the measured torques, (W, H, S)."""
-        return rollout_squares(self.robot, windows, self._reporting)
+        return rollout_squares(self.robot, windows, self._undescribed)
 
     def rollout_floor(self, windows: Windows, rng: np.random.Generator) -> FloatArray:
         """Return the squared errors that the noise of the sensors makes in it, (W, H, S)."""
-        return rollout_floor(self.robot, windows, self._reporting, rng)
+        return rollout_floor(self.robot, windows, self._undescribed, rng)
 
 
 def _missing_casters(robot: RobotDescription, recording: Recording) -> tuple[str, ...]:

@@ -772,6 +772,17 @@ def wheel_motion(motion: RobotMotion, numbers: ModelNumbers, around: Surrounding
     )  # fmt: skip
 
 
+def weights_on_steerings(motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:
+    """Torques (T, n) [N m] by which weights turn the steerings of a chassis that leans: (N b - m g c) x t, see the module."""
+    wheels, n = wheel_motion(motion, numbers), len(numbers.modules)
+    c, s = wheels.direction[:, :, 0], wheels.direction[:, :, 1]
+    ahead = wheels.tilt[:, :1] * c + wheels.tilt[:, 1:] * s
+    aside = wheels.tilt[:, 1:] * c - wheels.tilt[:, :1] * s
+    arm = wheels.normal[:, :n, None] * wheels.offset[:, :n] - GRAVITY * numbers.modules[:, :1] * numbers.modules[:, 1:3]
+    torque: FloatArray = arm[:, :, 0] * aside - arm[:, :, 1] * ahead
+    return torque
+
+
 def rolling_state(
     motion: RobotMotion, numbers: ModelNumbers, layout: ChannelLayout, around: Surroundings = NOTHING
 ) -> RollingState:
