@@ -60,3 +60,33 @@ def support_forces(weight, moment_x, moment_y, spring, centre, height, normal_fo
         if where < 0 or count <= 2:
             return
         lifted[where] = True
+
+
+@compiled
+def plane_gradient(centre, height):  # type: ignore[no-untyped-def]
+    """Slopes along x and y of the plane nearest to heights (n,) [m] at places (n, 2) [m]: how a body on equal springs stands.
+
+    Places on one line leave the slope across it at zero.
+    """
+    n = len(height)
+    mx, my, mh, flat = 0.0, 0.0, 0.0, True
+    for i in range(n):
+        mx += centre[i, 0] / n
+        my += centre[i, 1] / n
+        mh += height[i] / n
+        flat = flat and height[i] == height[0]
+    if flat:
+        return 0.0, 0.0
+    cxx, cxy, cyy, chx, chy = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        x, y, h = centre[i, 0] - mx, centre[i, 1] - my, height[i] - mh
+        cxx += x * x
+        cxy += x * y
+        cyy += y * y
+        chx += h * x
+        chy += h * y
+    ridge = 1e-9 * (cxx + cyy)
+    cxx += ridge
+    cyy += ridge
+    determinant = cxx * cyy - cxy * cxy
+    return (cyy * chx - cxy * chy) / determinant, (cxx * chy - cxy * chx) / determinant

@@ -385,6 +385,28 @@ def test_wheels_that_climb_slip_no_more_for_it(tmp_path: Path) -> None:
     assert np.all(left[1][3:11] < left[0][3:11] / 3.0), "0.4 to 0.9 of it if the push were a tyre's"
 
 
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"name": "uneven_ground", "target": [*THESIS.caster_names], "amplitude": 0.0015, "wavelength": 1.3, "direction": 0.7},
+        {"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 6e4},
+    ],
+    ids=lambda entry: str(entry["name"]),
+)
+def test_a_chassis_that_stands_askew_leans_its_steerings(tmp_path: Path, entry: dict[str, object]) -> None:
+    """In an engine of three dimensions, told where it does: twice what a healthy robot leaves was left, and more."""
+    robot = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))
+    askew, level = record(tmp_path / "askew", robot, 6, "pybullet"), record(tmp_path / "level", THESIS, 6, "pybullet")
+    left = []
+    for described, recording in ((THESIS, askew), (robot, askew), (THESIS, level)):
+        problem = RobotProblemBuilder(described, [recording]).build(with_terms=False)
+        left.append(np.sqrt(np.mean(np.where(problem.valid, problem.residual, 0.0) ** 2, axis=0)))
+    wrong, right = left[0] / left[2], left[1] / left[2]
+    print(wrong, right, sep="\n")
+    assert np.all(wrong[:3] > 1.5)
+    assert np.all(right < 1.4)
+
+
 def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path: Path) -> None:
     """b_x = 0 leaves no torque balance; the channels say so by their names, and no candidate is a torque."""
     recording = record(tmp_path, load_robot("thesis"), 5)

@@ -11,8 +11,9 @@ with H the same filter on both sides and P = 1 - A A^+. Each joint's own balance
     r F_x = tau_rho - I_rho rho_ddot - J_rp phi_ddot
     b_x F_y - b_y F_x = m c x a_c + I sigma_dot + J_pp phi_ddot + J_rp rho_ddot - tau_phi - M_scrub - (N b - m g c) x t
 
-A chassis that leans on its springs leans its steering axes: with t the vertical in its horizontal axes, the contact is where
-the wheel is lowest, b_x = b_x0 - r t_x in the wheel's frame, and weights turn the steering.
+A chassis that leans on its springs, or stands on uneven ground or on a wheel that gives way, leans its steering axes: with t
+the vertical in its horizontal axes, the contact is where the wheel is lowest, b_x = b_x0 - r t_x in the wheel's frame, and
+weights turn the steering.
 
 and the tyre under that force slips: eps = |V_w| lambda(F) + L d lambda / dt, the relaxed slip solved for eps. The robot's
 twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a missing force of a tenth of
@@ -49,7 +50,7 @@ from pcw_description.differential_kinematics import (
     wheel_jacobian_kernel,
 )
 from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
-from pcw_description.support_forces import support_forces
+from pcw_description.support_forces import plane_gradient, support_forces
 
 from .chassis_sway import ChassisSway
 from .regression_problem import Channel, FloatArray
@@ -667,6 +668,20 @@ def _contact_centre(steer_axis, caster_offset, direction):  # type: ignore[no-un
     return centre
 
 
+@compiled
+def _gradients(steer_axis, caster_offset, direction, height):  # type: ignore[no-untyped-def]
+    """Slopes (T, 2) of the planes nearest to the heights (T, n) under the wheels."""
+    found, centre = np.empty((len(height), 2)), np.empty(steer_axis.shape)
+    for t in range(len(height)):
+        for i in range(len(centre)):
+            c, s = direction[t, i, 0], direction[t, i, 1]
+            centre[i, 0] = steer_axis[i, 0] + caster_offset[i, 0] * c - caster_offset[i, 1] * s
+            centre[i, 1] = steer_axis[i, 1] + caster_offset[i, 0] * s + caster_offset[i, 1] * c
+        slope_x, slope_y = plane_gradient(centre, height[t])
+        found[t, 0], found[t, 1] = slope_x, slope_y
+    return found
+
+
 def _tilt(numbers: ModelNumbers, leaning: FloatArray, lean: FloatArray, direction: FloatArray) -> FloatArray:
     """The vertical in the horizontal axes of the chassis (T, 2): how it leans as it accelerates, and where it stands.
 
@@ -760,6 +775,9 @@ def wheel_motion(motion: RobotMotion, numbers: ModelNumbers, around: Surrounding
     tilt = np.zeros((len(twist), 2))
     if leaning is not None:
         tilt = _tilt(numbers, leaning, numbers.lean, direction)
+    if around.height is not None:
+        tilt = tilt + _gradients(numbers.steer_axis, numbers.caster_offset, direction, around.height)
+    if tilt.any():
         offset = _offsets(numbers, direction, tilt)
         twist, contradiction = _twists(numbers, steer_angle, direction, velocity, offset)
         twist_dot = derivative(twist, motion.rate)

@@ -9,7 +9,10 @@ wheel centres p, and the reflected rotors as armature on (rho, phi), the equatio
     rho:   I_rho rho_ddot + J_rp phi_ddot             = tau_rho - r F_x
 
 The joints are eliminated caster by caster, which leaves a 3x3 system (Schur complement). Normal forces follow the
-accelerations of the last step quasi-statically, as a rigid body on equal springs that push and do not pull.
+accelerations of the last step quasi-statically, as a rigid body on equal springs that push and do not pull. On uneven ground,
+or on a wheel that gives way, the chassis stands as the plane nearest to the heights under its wheels does, and its steering
+axes with it: with t the vertical in its horizontal axes, the contact is where the wheel is lowest, b_x - r t_x in the wheel's
+frame, and weights turn the steering by (N b - m g c) x t.
 
 A step takes tyres, friction and gears implicitly in the new velocities, by their slopes. The tyre force F at the end of
 a step follows from the step's mean slip velocity eps = J (v + v') / 2: with G the slopes of F over eps, the matrix is
@@ -42,7 +45,7 @@ from pcw_description.effects.kinds import (
 )
 from pcw_description.recording_series import IntArray
 from pcw_description.robot_description import FloatArray, RobotDescription
-from pcw_description.support_forces import support_forces
+from pcw_description.support_forces import plane_gradient, support_forces
 
 from .caster_arrays import (
     BX,
@@ -88,7 +91,7 @@ _X, _Y, _YAW, _VX, _VY, _OMEGA, _AX, _AY, _ALPHA, _TIME = range(10)
 # Per-caster numbers within a step: place and turn of the wheel, forces, and the two rows of what is eliminated.
 _C, _S, _PX, _PY, _FORCE_X, _FORCE_Y, _SPIN, _RHS_R, _RHS_P, _I_RR, _I_RP, _I_PP = range(12)
 _KR0, _KR1, _KR2, _KP0, _KP1, _KP2, _DZ_X, _DZ_Y, _G_X, _G_Y, _E_X0, _E_X1, _E_X2, _E_Y0, _E_Y1, _E_Y2, _R = range(12, 29)
-_SCRATCH = 29
+_B_X, _SCRATCH = 29, 30
 
 
 @compiled
@@ -146,6 +149,7 @@ def _advance(  # type: ignore[no-untyped-def]
             ground_under(i, body[_TIME], world_x, world_y, roll_angle, wheels[i, FZ], effects, at, ground[i])
             height[i] = ground[i, HEIGHT] + ground[i, RADIUS_CHANGE]
         com_x, com_y, com_z = com_x / total_mass, com_y / total_mass, com_z / total_mass
+        tilt_x, tilt_y = plane_gradient(centre, height)
         chassis_wrench(
             body[_TIME], body[_X], body[_Y], body[_YAW], vx, vy, omega, com_x, com_y, com_z, effects, at, wrench
         )
@@ -175,7 +179,10 @@ def _advance(  # type: ignore[no-untyped-def]
             c, s = row[_C], row[_S]
             rho_dot, phi_dot = wheel[RHO_DOT], wheel[PHI_DOT]
             sigma = phi_dot + omega
-            sx, sy, bx, by = casters[i, SX], casters[i, SY], casters[i, BX], casters[i, BY]
+            sx, sy, by = casters[i, SX], casters[i, SY], casters[i, BY]
+            ahead, aside = c * tilt_x + s * tilt_y, c * tilt_y - s * tilt_x
+            bx = casters[i, BX] - casters[i, RADIUS] * ahead
+            row[_B_X] = bx
             radius = casters[i, RADIUS] + ground[i, RADIUS_CHANGE]
             # Velocity of the wheel centre in the wheel frame.
             axis_x, axis_y = vx - omega * sy, vy + omega * sx
@@ -241,6 +248,8 @@ def _advance(  # type: ignore[no-untyped-def]
             force_along = fx + c * climb_x + s * climb_y
             rhs_r = tau_rho - radius * fx - normal[i] * ground[i, RADIUS_SLOPE]
             rhs_p = tau_phi + bx * force_across - by * force_along + spin - m * (lever_x * bias_y - lever_y * bias_x)
+            rhs_p += (normal[i] * bx + m * gravity[2] * casters[i, CX]) * aside
+            rhs_p -= (normal[i] * by + m * gravity[2] * casters[i, CY]) * ahead
             inertia_rr = casters[i, I_ROLL] + dt * s_rr + gx * radius * radius
             inertia_rp = casters[i, J_RP] + dt * s_rp + gx * radius * by
             inertia_pp = izz + m * (lever_x * lever_x + lever_y * lever_y) + casters[i, J_PP]
@@ -285,7 +294,7 @@ def _advance(  # type: ignore[no-untyped-def]
             rho_ddot = row[_I_RR] * rhs_r + row[_I_RP] * rhs_p
             phi_ddot = row[_I_RP] * rhs_r + row[_I_PP] * rhs_p
             # The mean slip of the step beyond the one it began with.
-            bx, by = casters[i, BX], casters[i, BY]
+            bx, by = row[_B_X], casters[i, BY]
             more_x = row[_R] * rho_ddot + by * phi_ddot + row[_E_X0] * d0 + row[_E_X1] * d1 + row[_E_X2] * d2
             more_y = -bx * phi_ddot + row[_E_Y0] * d0 + row[_E_Y1] * d1 + row[_E_Y2] * d2
             more_x *= half
