@@ -46,6 +46,11 @@ def physics(name: str, target: str, **values: float) -> EffectInstance:
     return EffectInstance(name, (target,), get(name).check(values, "physics"))
 
 
+def winding(time: float) -> np.ndarray:
+    """Return the twist of a drive that winds both ways."""
+    return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
+
+
 def sled(folder: Path, name: str, coulomb: float, seed: int, duration: float = 20.0) -> Path:
     """Write a CSV of a 20 kg sled on a path of sines, with friction and noise."""
     rng = np.random.default_rng(seed)
@@ -100,13 +105,9 @@ def test_windows_rolled_out_together_are_those_stepped_one_by_one() -> None:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, EffectInstance]:
     """A drive of a robot with friction on one caster."""
-
-    def twist(time: float) -> np.ndarray:
-        return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
-
     friction = physics("drive_coulomb_friction", "rear_left", coulomb=0.8)
     path = tmp_path_factory.mktemp("recorded") / "run"
-    record_run(dataclasses.replace(THESIS, physics=(friction,)), twist, 14.0, 1, path, controlled_as=THESIS)
+    record_run(dataclasses.replace(THESIS, physics=(friction,)), winding, 14.0, 1, path, controlled_as=THESIS)
     return path, friction
 
 
@@ -148,11 +149,7 @@ def test_torques_act_when_the_fit_says_that_they_did(recorded: tuple[Path, Effec
 
 def test_weights_turn_the_steerings_of_a_chassis_that_leans(tmp_path: Path) -> None:
     """Which the reduced plant does not know: in a steady curve it drifted off what an engine in three dimensions had done."""
-
-    def twist(time: float) -> np.ndarray:
-        return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
-
-    record_run(THESIS, twist, 14.0, 1, tmp_path / "run", "pybullet", controlled_as=THESIS)
+    record_run(THESIS, winding, 14.0, 1, tmp_path / "run", "pybullet", controlled_as=THESIS)
     nominal = RobotSubject(THESIS)
     windows = nominal.windows([nominal.open(tmp_path / "run", "fit", {})])
     assert windows is not None
@@ -172,13 +169,9 @@ def test_weights_turn_the_steerings_of_a_chassis_that_leans(tmp_path: Path) -> N
 
 def test_soft_tyres_have_taken_up_their_forces_where_a_window_begins(tmp_path: Path) -> None:
     """After a tenth of a second they had not, and the true robot was further off than one with the described tyres."""
-
-    def twist(time: float) -> np.ndarray:
-        return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
-
     soft = [physics("tyre_lateral_stiffness", caster, error=-0.8) for caster in THESIS.caster_names]
     path = tmp_path / "run"
-    record_run(dataclasses.replace(THESIS, physics=tuple(soft)), twist, 14.0, 1, path, controlled_as=THESIS)
+    record_run(dataclasses.replace(THESIS, physics=tuple(soft)), winding, 14.0, 1, path, controlled_as=THESIS)
     nominal = RobotSubject(THESIS)
     windows = nominal.windows([nominal.open(path, "fit", {})])
     assert windows is not None
