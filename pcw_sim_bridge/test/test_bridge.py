@@ -207,6 +207,14 @@ def test_lockstep_waits_for_a_controller_and_survives_its_end(ros):
     assert len(commander.states) > at_the_end + 50
 
 
+def test_lockstep_at_a_pace_goes_on_after_a_reading_that_nobody_answers(ros):
+    """Longer than the lag after which the pace begins anew."""
+    ros.start(BRIDGE, "-p", "lockstep:=true", "-p", "real_time_factor:=1.0", "-p", "lockstep_timeout:=0.3")
+    ros.peer.create_publisher(JointState, "joint_commands", 1)
+    joints = ros.listen(JointState, "joint_states")
+    ros.wait_for(lambda: len(joints) > 3)
+
+
 def test_refused_parameter_keeps_the_old_value(ros):
     ros.start(BRIDGE, "-p", "real_time_factor:=2.0")
 

@@ -31,10 +31,12 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from .node_tools import EventsExecutor
+from .node_tools import RUNNING, SETTING_UP, EventsExecutor
 
-# First contact takes seconds on a busy machine, and a cold cache compiles kernels; waits end as soon as they can [s].
+# First contact takes seconds on a busy machine; waits end as soon as they can [s].
 DEADLINE = 60.0
+# The longest that a wait stands still for nodes that compile: three at once, cold, beside other tests, took 75 s [s].
+SETTING_UP_DEADLINE = 240.0
 # A service is known before it knows who asks; the middleware gives up an answer that it cannot deliver within 0.1 s [s].
 FOUND_BY_SERVER = 0.3
 POLITENESS = 5.0  # in which a process that was asked to end may do so [s]
@@ -55,6 +57,11 @@ class NodeProcess:
     def log(self) -> str:
         """What it has printed so far."""
         return self._log_path.read_text(errors="replace")
+
+    @property
+    def sets_up(self) -> bool:
+        """Whether it has said that setting up takes long, as where kernels are compiled, and not yet that it runs."""
+        return self.process.poll() is None and SETTING_UP in (said := self.log) and RUNNING not in said
 
     def wait(self, deadline: float = DEADLINE) -> int:
         """Wait for its end and return the exit code."""
@@ -153,13 +160,19 @@ class RosTest:
         while_doing: Callable[[], object] | None = None,
         every: float = 0.02,
     ) -> Any:
-        """Return what `condition()` returns once that is true; call `while_doing` every so often [s] meanwhile."""
-        end, next_call = time.monotonic() + deadline, 0.0
+        """Return what `condition()` returns once that is true; call `while_doing` every so often [s] meanwhile.
+
+        The time in which a process is still setting up does not count, up to `SETTING_UP_DEADLINE`.
+        """
+        begun = time.monotonic()
+        end, next_call = begun + deadline, 0.0
         while True:
             found = condition()
             if found:
                 return found
             now = time.monotonic()
+            if now > end and now < begun + SETTING_UP_DEADLINE and any(process.sets_up for process in self._processes):
+                end = now + deadline
             if now > end:
                 said = "\n".join(f"--- {process.process.args}\n{process.log}" for process in self._processes)
                 raise AssertionError(f"not within {deadline:g} s\n{said}")

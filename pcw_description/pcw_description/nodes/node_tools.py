@@ -63,6 +63,8 @@ NANOSECONDS = 1_000_000_000
 # A signal that arrives while the executor sleeps is seen when it wakes, so this is the latency of a shutdown.
 SPIN_TIMEOUT = 0.1  # [s]
 PATIENCE = 5.0  # after so long of setting up the node says what it is doing [s]
+# What a node says where that is so, and once it has been set up.
+SETTING_UP, RUNNING = "still setting up", "running"
 LAST_WORDS = 1.0  # the longest that a node which ends waits for its listeners to hear them [s]
 
 
@@ -101,7 +103,7 @@ def run_nodes(factories: Iterable[Callable[[], Node]], args: Sequence[str] | Non
                         raise TypeError(f"{type(nodes[-1]).__name__} does not say all_declared(self) after its parameters")
             warn_of_unknown_overrides(nodes)
             others = f": {', '.join(node.get_name() for node in nodes)}" if len(nodes) > 1 else ""
-            nodes[0].get_logger().info(f"running{others}")
+            nodes[0].get_logger().info(f"{RUNNING}{others}")
             _spin(nodes, stops)
         except (KeyboardInterrupt, ExternalShutdownException):
             pass
@@ -140,7 +142,7 @@ def _answer_without_nodes(factories: Sequence[Callable[[], Node]], arguments: Se
 @contextmanager
 def _told_if_slow() -> Iterator[None]:
     """Say on stderr that it takes long to set up, as it does when inner loops are compiled: who waits may think it hangs."""
-    said = f"{_program_name()}: still setting up: inner loops are compiled the first time, for a minute or two"
+    said = f"{_program_name()}: {SETTING_UP}: inner loops are compiled the first time, for a minute or two"
     timer = threading.Timer(PATIENCE, lambda: print(f"{said}; a second Ctrl-C ends it at once", file=sys.stderr, flush=True))
     timer.daemon = True
     timer.start()

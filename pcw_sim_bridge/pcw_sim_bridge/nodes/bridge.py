@@ -133,6 +133,10 @@ class BridgeNode(Node):
             return not self._lockstep or (
                 self.count_publishers("joint_commands") > 0 and self._outputs.joint_states.get_subscription_count() > 0
             )
+        waits = self._lockstep and not self._answered
+        # Before the pace, which begins anew when it lags: a reading that nobody got would be waited for without an end.
+        if waits and now - self._last_published < self._lockstep_timeout:
+            return False
         if self._factor > 0.0:
             lag = (now - self._anchor_real) - (self._simulated.time_ns - self._anchor_ns) * 1e-9 / self._factor
             if lag < 0.0:
@@ -140,10 +144,7 @@ class BridgeNode(Node):
             if lag > LARGEST_LAG:
                 self._overruns += 1
                 self._anchor()
-        if self._lockstep and not self._answered:
-            if now - self._last_published < self._lockstep_timeout:
-                return False
-            self._unanswered += 1
+        self._unanswered += waits
         return True
 
     def _advance(self) -> None:
