@@ -11,7 +11,6 @@ import dataclasses
 
 import numpy as np
 import numpy.typing as npt
-import scipy.optimize
 
 from .differential_kinematics import wheel_centres, wheel_jacobian
 from .errors import KinematicsError
@@ -76,6 +75,9 @@ def find_singular_configuration(
     Returns:
         Headings (n,) [rad] and their analysis; it is singular wherever the actuation has singular configurations.
     """
+    # Here, since it takes half a second, for which every node that starts would wait.
+    from scipy.optimize import minimize
+
     rng = np.random.default_rng(seed)
 
     def held(angles: FloatArray) -> float:
@@ -83,7 +85,7 @@ def find_singular_configuration(
 
     best = min(
         (
-            scipy.optimize.minimize(
+            minimize(
                 held, rng.uniform(-np.pi, np.pi, robot.n), method="Nelder-Mead",
                 options={"xatol": 1e-13, "fatol": 1e-13, "maxiter": 4000},
             )

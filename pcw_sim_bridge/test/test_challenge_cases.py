@@ -250,6 +250,7 @@ def test_what_no_healthy_robot_has_costs_more_than_any_tolerance() -> None:
     assert tolerated_cost(THESIS, slope) == pytest.approx(2.0)
 
 
+@pytest.mark.nightly
 def test_what_moves_the_robot_otherwise_has_no_more_evidence_than_its_tolerances_cost() -> None:
     """All steering zeros 2.85 deviations off drive another way: what differs on the way is no evidence of anything."""
     robot = load_robot("tidybot2")
@@ -331,7 +332,7 @@ def test_a_case_is_drawn_until_a_robot_can_be_driven_so(
 
 
 @pytest.mark.parametrize(
-    "masking", [pytest.param(m, marks=() if m in ("retuned", "cancelling") else pytest.mark.nightly) for m in MASKINGS]
+    "masking", [pytest.param(m, marks=() if m == "retuned" else pytest.mark.nightly) for m in MASKINGS]
 )
 def test_masked_cases_are_masked(masking: str) -> None:
     orders = order_cases(16, 2, kinds=("masked",), plants=("reduced",), durations=(15.0, 16.0))

@@ -96,3 +96,28 @@ def test_weak_drives_and_steerings_are_a_payload_unless_the_recording_objects(lo
     assert names == (["payload_mass"] if loaded else ["torque_constant_error"] * 2)
     if loaded:
         assert found.fit.mean[-1] == pytest.approx(18.0, rel=0.05)
+
+
+@pytest.mark.parametrize("by_load", [True, False])
+def test_a_friction_and_a_resistance_at_one_wheel_are_a_resistance_at_all_of_them_unless_the_recording_objects(by_load):
+    """From where both are named neither gives way to one more: what tells them apart, the load, was judged beside them."""
+    robot = load_robot("thesis")
+    first = robot.caster_names[0]
+    effects = [EffectInstance("rolling_resistance", robot.caster_names, {"arm": 5e-4})]
+    if not by_load:
+        effects = [
+            EffectInstance("drive_coulomb_friction", robot.caster_names, {"coulomb": 0.14}),
+            EffectInstance("rolling_resistance", (first,), {"arm": 3e-4}),
+        ]
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "identification", 12.0, 3), effects)
+    problem = RobotProblemBuilder(robot, [recording]).build()
+    wanted = [("drive_coulomb_friction", robot.caster_names), ("rolling_resistance", (first,))]
+    instances = [Instance(k, (), (0,)) for k, term in enumerate(problem.terms) if (term.effect, term.target) in wanted]
+    search = EffectSearch(problem, np.random.default_rng(0))
+    both = search.conclude(search.made_exact(tuple(instances)), search.settings.smallest_threshold)
+    found = search.with_one_look_alike(both)
+    named = [(problem.terms[instance.term].effect, problem.terms[instance.term].target) for instance in found.fit.instances]
+    if by_load:
+        assert named == [("rolling_resistance", robot.caster_names)]
+    else:
+        assert sorted(named) == wanted

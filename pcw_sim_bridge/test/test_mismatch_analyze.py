@@ -159,9 +159,8 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
     assert caster in done.stdout
 
 
-@pytest.mark.parametrize(
-    "name", ["flow_base", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("dyros_pcv", "xr4000", "tidybot2"))]
-)
+@pytest.mark.nightly  # a whole analysis, like that of others here
+@pytest.mark.parametrize("name", ["flow_base", "dyros_pcv", "xr4000", "tidybot2"])
 def test_intervals_hold_the_truth_on_other_robots(name: str, tmp_path: Path) -> None:
     """Other sizes, offsets and gear couplings; the friction is 4 % of what the drive can give."""
     nominal = load_robot(name)

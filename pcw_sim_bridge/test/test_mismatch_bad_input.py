@@ -282,7 +282,7 @@ def test_a_recording_that_was_cut_off_is_used_as_far_as_it_goes(
     assert report["inputs"][0]["warnings"]
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_interrupting_leaves_the_earlier_report_and_nothing_else(recorded: Path, tmp_path: Path, signum: int) -> None:
     """In the middle of a run that would have replaced a report, also from a shell that has its jobs ignore Ctrl-C."""
     out = tmp_path / "report"

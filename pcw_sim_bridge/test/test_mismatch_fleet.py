@@ -210,6 +210,7 @@ def test_no_more_tasks_are_in_flight_than_keep_the_workers_busy() -> None:
     assert workers.most <= workers.in_flight
 
 
+@pytest.mark.nightly
 def test_a_dask_cluster_gives_the_same_results(tmp_path: Path) -> None:
     """The same function over the wire, at a cluster that somebody else has started."""
     distributed = pytest.importorskip("distributed")

@@ -111,10 +111,8 @@ def test_after_the_suggested_manoeuvre_one_is_named_without_the_other(
     assert second not in findings.effects[0].ambiguous_with
 
 
-@pytest.mark.parametrize(
-    ("name", "arm"),
-    [("steps", 2e-3), *(pytest.param(*which, marks=pytest.mark.nightly) for which in (("chirp_x", 2e-3), ("strafe", 5e-4)))],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize(("name", "arm"), [("steps", 2e-3), ("chirp_x", 2e-3), ("strafe", 5e-4)])
 def test_what_is_foretold_is_about_what_a_recording_gives(name: str, arm: float) -> None:
     """The evidence between the two sets in a simulated recording, against its expectation: within a factor of two.
 
@@ -138,6 +136,7 @@ def test_what_is_foretold_is_about_what_a_recording_gives(name: str, arm: float)
     assert 0.5 * outcome.nats - 5.0 < given < 2.0 * outcome.nats + 5.0
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_more_noise_in_the_report_asks_for_more_seconds() -> None:
     """The noise of the real recordings counts where the simulated one is quieter."""
     quiet, loud = (

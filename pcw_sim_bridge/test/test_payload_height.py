@@ -22,6 +22,7 @@ def wandering(time: float) -> np.ndarray:
     return min(time, 1.0) * np.array([0.5 * np.sin(1.3 * time), 0.4 * np.sin(0.9 * time + 1.0), 0.7 * np.sin(0.7 * time)])
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_a_low_payload_on_springs_is_not_found_too_light(tmp_path: Path) -> None:
     """Taken for half a metre high, 20.9 kg at half of that came out at 18.5 kg in PyBullet."""
     payload = {"name": "payload_mass", "target": ["chassis"], "mass": 20.9, "x": 0.2, "y": 0.0, "z": 0.25}

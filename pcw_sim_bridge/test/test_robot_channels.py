@@ -172,7 +172,15 @@ def test_rotors_of_coupled_gears_are_wrong_at_both_joints(rotor: str) -> None:
     assert varied.modules == pytest.approx(described.modules, rel=1e-12)
 
 
-@pytest.mark.parametrize("changed", ["wheel.inertia_axle", "module.mass", "contact.stiffness", "drive_coulomb_friction"])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        pytest.param("wheel.inertia_axle", marks=pytest.mark.nightly),
+        pytest.param("module.mass", marks=pytest.mark.nightly),
+        "contact.stiffness",
+        "drive_coulomb_friction",
+    ],
+)
 def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, changed: str) -> None:
     """An inertia that was scaled, not added to, lost 57 % of its column with 57 % of itself, and what a torque does to the
     slips of a soft tyre was that of the described one: a search that made its problem exact there ran from its own optimum.
@@ -368,6 +376,7 @@ def test_effects_of_every_kind_that_the_description_holds_are_not_left_over(tmp_
     assert np.all(left[1] < 1.5 * left[2])
 
 
+@pytest.mark.nightly
 def test_wheels_that_climb_slip_no_more_for_it(tmp_path: Path) -> None:
     """Waves of the floor, in the file too: the wrench they push with is accounted for, and no slip is predicted from it."""
     nominal = load_robot("thesis")
@@ -389,7 +398,9 @@ def test_wheels_that_climb_slip_no_more_for_it(tmp_path: Path) -> None:
     "entry",
     [
         {"name": "uneven_ground", "target": [*THESIS.caster_names], "amplitude": 0.0015, "wavelength": 1.3, "direction": 0.7},
-        {"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 6e4},
+        pytest.param(
+            {"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 6e4}, marks=pytest.mark.nightly
+        ),
     ],
     ids=lambda entry: str(entry["name"]),
 )
@@ -493,6 +504,7 @@ def test_tyres_that_differ_are_not_said_to_relax_alike(tmp_path: Path) -> None:
     assert sorted(relaxing) == sorted((name,) for name in THESIS.caster_names)
 
 
+@pytest.mark.nightly
 def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path) -> None:
     """Exact where it was at work in the second, the model leaves the first as it was, and less of the second."""
     push = {"name": "external_push", "target": ["chassis"], "force_x": 40.0, "start": 5.0, "duration": 2.0}

@@ -35,10 +35,10 @@ CONCEALED = [
         "reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02, "tracker_offset": 0.03}, marks=NIGHTLY
     ),
     pytest.param("pybullet", {"name": "ground_slope", "target": ["chassis"], "angle": 0.03, "direction": 1.0}, marks=NIGHTLY),
-    ("reduced", {"name": "aerodynamic_drag", "target": ["chassis"], "coefficient": 8.0}),
+    pytest.param("reduced", {"name": "aerodynamic_drag", "target": ["chassis"], "coefficient": 8.0}, marks=NIGHTLY),
     pytest.param("pybullet", {"name": "payload_offset", "target": ["chassis"], "x": 0.05}, marks=NIGHTLY),
     # Its teeth give way as much as it plays.
-    ("mujoco", {"name": "gear_backlash", "target": ["front_right"], "play": 3e-4}),
+    pytest.param("mujoco", {"name": "gear_backlash", "target": ["front_right"], "play": 3e-4}, marks=NIGHTLY),
 ]
 
 
@@ -67,6 +67,7 @@ def test_a_concealed_effect_is_named_with_its_numbers(plant: str, entry: dict[st
     assert findings.fit.gap_closed > 0.9
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None:
     """Without a tracker the yaw is that of the wheels, from the start of the recording."""
     sensors = dataclasses.replace(THESIS.sensors, tracker=None)
@@ -90,8 +91,8 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
         pytest.param("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
                                      "cosine": 0.03, "sine": -0.02}, 0.001, marks=NIGHTLY),
         # A steering that turns one way here and the other way there leaves a torque by its angle where that is not named.
-        ("reduced", 1, {"name": "steer_coulomb_friction", "target": ["front_left"], "coulomb": 0.4,
-                     "asymmetry": -0.15}, 0.003),
+        pytest.param("reduced", 1, {"name": "steer_coulomb_friction", "target": ["front_left"], "coulomb": 0.4,
+                     "asymmetry": -0.15}, 0.003, marks=NIGHTLY),
     ],
     ids=["a tyre behind its own number", "coggings of all as one", "a friction by direction behind an angle"],
 )  # fmt: skip
@@ -115,7 +116,7 @@ def test_what_hid_is_named(plant: str, seed: int, entry: dict[str, object], with
         # Its ends fell on samples of the motion: 23 ms beside the truth, said to be known to 6.
         ({"name": "external_push", "force_x": 20.0, "force_y": 8.0, "start": 7.2137, "duration": 3.0411}, 0.003),
         # A wheel that gives way hands a part of its load to the others; 12 % too stiff, said to be known to 3.
-        ({"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 50e3}, 1500.0),
+        pytest.param({"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 50e3}, 1500.0, marks=NIGHTLY),
     ],
     ids=["a push between samples", "a wheel that gives way"],
 )  # fmt: skip
@@ -132,6 +133,7 @@ def test_numbers_are_as_exact_as_they_are_said_to_be(entry: dict[str, object], w
         assert found.low < true < found.high
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_noise_of_reported_torques_scales_nothing(tmp_path: Path) -> None:
     """Steering motors that are 13 % weak were drives that are 17 % strong and a payload of 9 kg: forces and loads that are all
     larger predict slips with less of the torques' noise in them, and gains of what was reported hold that noise themselves.
@@ -154,6 +156,7 @@ def test_noise_of_reported_torques_scales_nothing(tmp_path: Path) -> None:
         assert estimate.low < float(str(entry[name])) < estimate.high
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_more_friction_is_no_more_scrub(tmp_path: Path) -> None:
     """Scrub is of friction times a radius: with tyres that have a fifth more of it the radius came out a tenth too large."""
     robot = load_robot("tidybot2")

@@ -39,7 +39,14 @@ def simulated(folder: Path, *arguments: str, excite="chirps", duration="10", see
     return Recording.open(out, THESIS)
 
 
-@pytest.mark.parametrize("arguments", [[], ["--controller", "velocity_loops"], ["--plant", "pybullet", "--ideal"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        pytest.param([], marks=pytest.mark.nightly),
+        pytest.param(["--controller", "velocity_loops"], marks=pytest.mark.nightly),
+        ["--plant", "pybullet", "--ideal"],
+    ],
+)
 def test_the_same_arguments_give_the_same_bytes(tmp_path, arguments):
     for folder in ("first", "second", "other"):
         simulated(tmp_path / folder, *arguments, excite="random_goals", seed="8" if folder == "other" else "7")

@@ -183,7 +183,7 @@ def test_no_factor_of_all_torques_and_masses_takes_errors_away(tmp_path: Path) -
     ("name", "controller", "mass"),
     [
         pytest.param("flow_base", "velocity_loops", 5.0, marks=pytest.mark.nightly),
-        ("tidybot2", "computed_torque", 15.0),
+        pytest.param("tidybot2", "computed_torque", 15.0, marks=pytest.mark.nightly),
     ],
 )
 def test_a_payload_is_no_weakness_of_all_motors(tmp_path: Path, name: str, controller: str, mass: float) -> None:

@@ -169,7 +169,7 @@ def analysed(path: Path, *held_out: Path) -> Analysis:
     ("law", "channel", "leading", "known"),
     [
         (friction_by_steering, "drive_torque/front_right", "steer_angle/front_right", "cos(steer_angle/front_right)"),
-        (fading_torque, "drive_torque/rear_left", "time", "exp(-time /"),
+        pytest.param(fading_torque, "drive_torque/rear_left", "time", "exp(-time /", marks=pytest.mark.nightly),
         pytest.param(
             coupling, "drive_torque/front_left", "drive_velocity/front_left", "front_left - drive_velocity/rear_right",
             marks=pytest.mark.nightly,
@@ -190,6 +190,7 @@ def test_it_is_said_so_with_the_leading_variable_and_no_name(law, channel, leadi
     assert any(note.startswith(f"The simulation is without unknown/{channel}") for note in findings.notes)
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_one_place_of_a_turn_is_no_row_of_coggings(tmp_path, monkeypatch):
     findings = analysed(record(tmp_path / "run", hard_spot, 3, monkeypatch)).findings
     assert (findings.verdict, findings.effects) == ("unexplained", ())
@@ -198,6 +199,7 @@ def test_one_place_of_a_turn_is_no_row_of_coggings(tmp_path, monkeypatch):
     assert unknown.share_explained > 0.8
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_a_small_torque_is_told_where_nothing_is_named_and_the_model_errs_otherwise(tmp_path, monkeypatch):
     """Less than a fiftieth of what is measured; nothing was said to be missing."""
     small = functools.partial(hard_spot, size=0.03)
@@ -206,6 +208,7 @@ def test_a_small_torque_is_told_where_nothing_is_named_and_the_model_errs_otherw
     assert findings.unknown[0].depends_on[0] == "drive_angle/rear_left"
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_what_changes_with_the_time_is_told_where_it_is_a_small_part_of_what_is_measured(tmp_path, monkeypatch):
     """Less than three times what a scale may be off, it was taken for a detail of the model; but those do not fade."""
     findings = analysed(record(tmp_path / "run", fading_a_little, 3, monkeypatch)).findings
@@ -214,6 +217,7 @@ def test_what_changes_with_the_time_is_told_where_it_is_a_small_part_of_what_is_
     assert unknown.depends_on[0] == "time"
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_a_motor_that_is_much_weaker_one_way_is_no_gear_friction(tmp_path, monkeypatch):
     """So much of its torque no law was allowed to take away: a friction under load was named, surely, and an unknown rest."""
     findings = analysed(record(tmp_path / "run", weak_one_way, 3, monkeypatch, "random_goals", 40.0)).findings
@@ -221,11 +225,12 @@ def test_a_motor_that_is_much_weaker_one_way_is_no_gear_friction(tmp_path, monke
     assert ("drive_torque/front_left", "drive_torque/front_left") in {(u.channel, u.depends_on[0]) for u in findings.unknown}
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 @pytest.mark.parametrize(
     ("part", "excitation", "duration", "seed"),
     [
-        pytest.param(0.02, "identification", 25.0, 3, marks=pytest.mark.nightly),
-        pytest.param(0.02, "identification", 25.0, 4, marks=pytest.mark.nightly),
+        (0.02, "identification", 25.0, 3),
+        (0.02, "identification", 25.0, 4),
         # Looked at sample by sample it is one of many laws that noise makes look better.
         (0.014, "chirps", 30.0, 6),
     ],
@@ -239,9 +244,8 @@ def test_a_law_as_small_as_the_name_that_it_replaces_is_told_of(part, excitation
     assert (unknown.channel, unknown.depends_on) == ("drive_torque/front_left", ("drive_torque/front_left",))
 
 
-@pytest.mark.parametrize(
-    ("excitation", "seed"), [pytest.param("identification", 3, marks=pytest.mark.nightly), ("random_goals", 4)]
-)
+@pytest.mark.nightly  # a whole analysis, like that of others here
+@pytest.mark.parametrize(("excitation", "seed"), [("identification", 3), ("random_goals", 4)])
 def test_a_quadratic_drag_is_no_viscous_friction_beside_it(excitation, seed, tmp_path, monkeypatch):
     """Its formula goes to the ends of what was seen, where a drag is largest: nothing is left there for another name.
 
@@ -254,7 +258,8 @@ def test_a_quadratic_drag_is_no_viscous_friction_beside_it(excitation, seed, tmp
     assert unknown.depends_on == ("steer_velocity/front_right",)
 
 
-@pytest.mark.parametrize("size", [pytest.param(0.005, marks=pytest.mark.nightly), 0.002])
+@pytest.mark.nightly  # a whole analysis, like that of others here
+@pytest.mark.parametrize("size", [0.005, 0.002])
 def test_a_small_drag_of_all_steerings_is_no_viscous_friction(tmp_path, monkeypatch, size):
     """It is a fair part of the friction that looks most like it, though not of what is measured.
 
@@ -328,6 +333,7 @@ def test_the_generated_effect_brings_simulator_and_held_out_recording_together(t
     assert slowed[1] == pytest.approx(slowed[0], abs=0.02)
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_a_law_that_is_not_there_in_other_recordings_is_in_no_patch(tmp_path, monkeypatch):
     """It is told of, since it was there; but nothing is claimed of a patch with it."""
     fit = record(tmp_path / "fit", friction_by_steering, 3, monkeypatch)

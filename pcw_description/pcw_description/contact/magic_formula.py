@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import scipy.optimize
-
 from ..compiled import compiled
 from ..errors import DescriptionError, nearest_name
 
@@ -37,10 +35,15 @@ def shape_numbers(mu_p: float, lambda_p: float, shape: Mapping[str, float]) -> t
     def offset(x: float) -> float:
         return x - e * (x - math.atan(x)) - target
 
+    if e == 0.0:
+        return target / lambda_p, c, e
+    # Here, since it takes half a second, for which every node that starts would wait.
+    from scipy.optimize import brentq
+
     upper = 1.0
     while offset(upper) < 0.0:
         upper *= 2.0
-    return float(scipy.optimize.brentq(offset, 0.0, upper, xtol=1e-14)) / lambda_p, c, e
+    return float(brentq(offset, 0.0, upper, xtol=1e-14)) / lambda_p, c, e
 
 
 @compiled

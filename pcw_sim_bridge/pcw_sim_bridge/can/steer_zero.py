@@ -17,7 +17,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from pcw_description.differential_kinematics import joint_matrix_blocks
 from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDescription
@@ -77,6 +76,9 @@ def estimate_steer_zeros(robot: RobotDescription, position: FloatArray, velocity
 
 
 def _fit(robot: RobotDescription, angle: FloatArray, sensed: FloatArray, start: FloatArray) -> FloatArray:
+    # Here, since it takes half a second, for which a driver that starts would wait.
+    from scipy.optimize import least_squares
+
     def residuals(offset: FloatArray) -> FloatArray:
         return _residuals(robot, angle, sensed, offset)
 

@@ -128,7 +128,7 @@ class EffectSearch(SetGrowth):
         threshold = self.calibrate(regression, instances)
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
         selection = self.against_alike(self.against_fewer(self.with_best_waves(self.gathered(selection))))
-        selection = self.with_one_cause(selection)
+        selection = self.with_one_look_alike(self.with_one_cause(selection))
         return self.with_outlines(self.bounded(self.retuned_away(selection)))
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
@@ -267,14 +267,39 @@ class EffectSearch(SetGrowth):
             others = tuple(i for i in selection.fit.instances if i not in (first, second))
             alike = [name for name in all_effects()[one.effect].look_alikes if all_effects()[name].target_kind == "chassis"]
             for rival in (k for k, term in enumerate(terms) if term.effect in alike):
-                instead, odds = self._with_rival(selection, others, rival)
+                instead, odds = self._with_rival(selection, others, rival, -selection.threshold)
                 if instead is not selection:
                     self.where_exact[rival, first.term] = min(-odds, REPLACED_ODDS)
                     return instead
         return selection
 
-    def _with_rival(self, selection: Selection, others: tuple[Instance, ...], rival: int) -> tuple[Selection, float]:
-        """A smaller set with another term, from where nothing was named on, and its log odds, unless these are too low."""
+    def with_one_look_alike(self, selection: Selection) -> Selection:
+        """Exchange an effect of some casters, and its look-alike of a part of them, for that look-alike of all of them.
+
+        Drives that rub and tyres that resist differ by the load of the wheels alone. Where that load was misjudged while the
+        first was named, the second makes up for the difference at one wheel, and neither gives way to any further one.
+        """
+        terms = self.problem.terms
+        for first, second in itertools.permutations(selection.fit.instances, 2):
+            one, other = terms[first.term], terms[second.term]
+            known = all_effects().get(one.effect)
+            if known is None or other.effect not in known.look_alikes or not set(other.target) < set(one.target):
+                continue
+            others = tuple(i for i in selection.fit.instances if i not in (first, second))
+            for rival, term in enumerate(terms):
+                if (term.effect, term.axis, term.target) != (other.effect, other.axis, one.target):
+                    continue
+                instead, odds = self._with_rival(selection, others, rival, 0.0)
+                if instead is not selection:
+                    self.where_exact[rival, first.term] = -odds
+                    return instead
+                self.where_exact[first.term, rival] = odds
+        return selection
+
+    def _with_rival(
+        self, selection: Selection, others: tuple[Instance, ...], rival: int, least: float
+    ) -> tuple[Selection, float]:
+        """A smaller set with another term, from where nothing was named on, and its log odds; the old one if below `least`."""
         here = self.problem, self._point
         self.problem, self._point = self.unexplained
         regression = self.whiten_beside(others)
@@ -292,8 +317,10 @@ class EffectSearch(SetGrowth):
                 odds += 0.5 * noise.odds(evidence - own, own_left, left)
             said = " and ".join(map(self.label, instead.fit.instances))
             self.progress(f"{said} instead, from the beginning: log odds {odds:.1f}")
-            if odds > -selection.threshold and any(found.term == rival for found in instead.fit.instances):
+            if odds > least and any(found.term == rival for found in instead.fit.instances):
                 return instead, odds
+            self.problem, self._point = here
+            return selection, odds
         self.problem, self._point = here
         return selection, -math.inf
 
