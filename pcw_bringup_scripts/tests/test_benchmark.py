@@ -10,6 +10,7 @@ import pytest
 from pcw_bringup_scripts import benchmark
 
 
+@pytest.mark.nightly  # compiles nearly all kernels there are
 def test_one_run_prints_and_writes_every_figure(tmp_path, capsys):
     file = tmp_path / "figures.json"
     assert benchmark.main(["--repeats", "1", "--json", str(file)]) == 0

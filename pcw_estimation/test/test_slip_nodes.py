@@ -120,6 +120,7 @@ def test_that_nothing_slips_is_said_only_by_who_has_an_imu(ros):
     robot.run(lambda: both <= set(statuses(diagnostics)) and messages() == [ALONE, "no slip"])
 
 
+@pytest.mark.nightly
 def test_method_and_learned_noise_are_parameters(ros, tmp_path):
     SlipNoise.of_robot(THESIS).save(tmp_path / "noise.yaml", "thesis")
     ros.start(

@@ -44,10 +44,11 @@ def test_leads_are_found_where_first_orders_say_nothing_of_them(tmp_path: Path, 
     assert [lead == 0.0 for lead in leads] == [lead == 0.0 for lead in wanted]
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 @pytest.mark.parametrize(
     ("inertial", "tracked", "more"),
     [
-        pytest.param(0.15, 0.0, (), marks=pytest.mark.nightly),
+        (0.15, 0.0, ()),
         (0.0, -0.2, ({"name": "drive_coulomb_friction", "target": ["front_left"], "coulomb": 0.5},)),
     ],
 )

@@ -73,6 +73,16 @@ def test_a_dead_time_that_reaches_a_little_into_the_second_cycle_is_none_of_a_si
     assert estimate.low < 0.0071 < estimate.high and estimate.value == pytest.approx(0.0071, rel=0.02)
 
 
+def test_a_dead_time_of_many_cycles_is_as_long_as_it_is():
+    """At 500 Hz all of 10 to 11 ms are one; with no time on the grid beyond, one of 11.16 ms was 9.96, give or take 0.03."""
+    robot = load_robot("thesis")
+    concealed = EffectInstance("actuator_delay", robot.caster_names, {"delay": 0.01116}, "steer")
+    [(named, instance)] = found(concealed, robot=robot).named
+    assert (instance.name, instance.target, instance.axis) == ("actuator_delay", robot.caster_names, "steer")
+    estimate = named.estimates["delay"]
+    assert estimate.low < 0.01116 < estimate.high and estimate.value == pytest.approx(0.01116, rel=0.02)
+
+
 @pytest.mark.parametrize(("part_of_a_delay", "doubted"), [(90.0, True), (-2.0, True), (-20.0, False)])
 def test_what_a_part_of_another_effect_explains_as_well_is_named_with_it(part_of_a_delay, doubted):
     """A dead time of 2.1 ms at 300 Hz shows in a part of the samples; two of four drives were given a lag, p = 1."""

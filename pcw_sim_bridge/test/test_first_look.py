@@ -124,6 +124,7 @@ def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object
         assert place.intervals[0][0] == pytest.approx(problem.time[inside.any(axis=1)][0], abs=0.1)
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_other_waves_are_asked_beside_what_was_found(tmp_path: Path) -> None:
     """From waves that do nearly as well no search leads to those that are there: other ones have to be tried again."""
     entry = {"name": "uneven_ground", "target": CASTERS, "amplitude": 0.001, "wavelength": 1.9, "direction": 2.6}

@@ -158,8 +158,8 @@ def without_imu(drive: Drive) -> Drive:
         (degrees, "degrees"),
         pytest.param(revolutions_per_minute, "rpm", marks=pytest.mark.nightly),
         pytest.param(velocity_in_counts, "counts", marks=pytest.mark.nightly),
-        (without_truth, ""),
-        (without_imu, ""),
+        pytest.param(without_truth, "", marks=pytest.mark.nightly),
+        pytest.param(without_imu, "", marks=pytest.mark.nightly),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )

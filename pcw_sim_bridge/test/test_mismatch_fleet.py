@@ -120,6 +120,7 @@ def test_a_fleet_says_what_appeared_when_and_a_second_run_does_nothing_again(tmp
     assert sorted(Path(result["path"]).name for result in last) == ["day0.csv", "day5.csv"]
 
 
+@pytest.mark.nightly
 def test_an_interrupted_run_keeps_what_is_done(tmp_path: Path) -> None:
     """Ctrl-C: exit code 130, whole lines only, no worker left behind, and the next run goes on from there."""
     wearing_sleds(tmp_path)

@@ -146,6 +146,7 @@ def test_more_noise_in_the_report_asks_for_more_seconds() -> None:
     assert loud.nats < 0.5 * quiet.nats
 
 
+@pytest.mark.nightly
 def test_a_load_on_a_corner_helps_where_no_manoeuvre_does() -> None:
     """Of what even load leaves open, a known load on one corner tells more in the same manoeuvre."""
     [steps] = few("steps")

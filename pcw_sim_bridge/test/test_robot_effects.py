@@ -24,24 +24,23 @@ THESIS, DYROS = load_robot("thesis"), load_robot("dyros_pcv")
 NIGHTLY = pytest.mark.nightly
 CONCEALED = [
     ("pybullet", {"name": "wheel_radius_error", "target": ["front_left"], "error": 1.0e-3}),
-    pytest.param("reduced", {"name": "wheel_radius_error", "target": [*THESIS.caster_names], "error": 1.5e-3}, marks=NIGHTLY),
-    pytest.param("pybullet", {"name": "steer_zero_offset", "target": ["front_right"], "offset": 0.03}, marks=NIGHTLY),
-    pytest.param("reduced", {"name": "caster_offset_error", "target": ["rear_left"], "x": 3e-3}, marks=NIGHTLY),
-    pytest.param("reduced", {"name": "imu_bias", "target": ["imu"], "gyro": 0.03}, marks=NIGHTLY),
-    pytest.param("pybullet", {"name": "imu_scale", "target": ["imu"], "gyro": 0.05}, marks=NIGHTLY),
-    pytest.param("pybullet", {"name": "imu_lever_arm", "target": ["imu"], "x": 0.08}, marks=NIGHTLY),
-    pytest.param("reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02}, marks=NIGHTLY),
-    pytest.param(
-        "reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02, "tracker_offset": 0.03}, marks=NIGHTLY
-    ),
-    pytest.param("pybullet", {"name": "ground_slope", "target": ["chassis"], "angle": 0.03, "direction": 1.0}, marks=NIGHTLY),
-    pytest.param("reduced", {"name": "aerodynamic_drag", "target": ["chassis"], "coefficient": 8.0}, marks=NIGHTLY),
-    pytest.param("pybullet", {"name": "payload_offset", "target": ["chassis"], "x": 0.05}, marks=NIGHTLY),
+    ("reduced", {"name": "wheel_radius_error", "target": [*THESIS.caster_names], "error": 1.5e-3}),
+    ("pybullet", {"name": "steer_zero_offset", "target": ["front_right"], "offset": 0.03}),
+    ("reduced", {"name": "caster_offset_error", "target": ["rear_left"], "x": 3e-3}),
+    ("reduced", {"name": "imu_bias", "target": ["imu"], "gyro": 0.03}),
+    ("pybullet", {"name": "imu_scale", "target": ["imu"], "gyro": 0.05}),
+    ("pybullet", {"name": "imu_lever_arm", "target": ["imu"], "x": 0.08}),
+    ("reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02}),
+    ("reduced", {"name": "clock_offset", "target": ["clock"], "offset": 0.02, "tracker_offset": 0.03}),
+    ("pybullet", {"name": "ground_slope", "target": ["chassis"], "angle": 0.03, "direction": 1.0}),
+    ("reduced", {"name": "aerodynamic_drag", "target": ["chassis"], "coefficient": 8.0}),
+    ("pybullet", {"name": "payload_offset", "target": ["chassis"], "x": 0.05}),
     # Its teeth give way as much as it plays.
-    pytest.param("mujoco", {"name": "gear_backlash", "target": ["front_right"], "play": 3e-4}, marks=NIGHTLY),
+    ("mujoco", {"name": "gear_backlash", "target": ["front_right"], "play": 3e-4}),
 ]
 
 
+@NIGHTLY  # a whole analysis each; `mismatch analyze` of one robot is tried daily
 @pytest.mark.parametrize(("plant", "entry"), CONCEALED, ids=lambda value: value["name"] if isinstance(value, dict) else value)
 def test_a_concealed_effect_is_named_with_its_numbers(plant: str, entry: dict[str, object], tmp_path: Path) -> None:
     """One run of the excitation that tells effects apart best; the patch brings the held-out channels nearer."""
@@ -110,13 +109,14 @@ def test_what_hid_is_named(plant: str, seed: int, entry: dict[str, object], with
         assert found.low < true < found.high
 
 
+@NIGHTLY
 @pytest.mark.parametrize(
     ("entry", "within"),
     [
         # Its ends fell on samples of the motion: 23 ms beside the truth, said to be known to 6.
         ({"name": "external_push", "force_x": 20.0, "force_y": 8.0, "start": 7.2137, "duration": 3.0411}, 0.003),
         # A wheel that gives way hands a part of its load to the others; 12 % too stiff, said to be known to 3.
-        pytest.param({"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 50e3}, 1500.0, marks=NIGHTLY),
+        ({"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 50e3}, 1500.0),
     ],
     ids=["a push between samples", "a wheel that gives way"],
 )  # fmt: skip

@@ -30,6 +30,7 @@ def test_the_ground_is_found_from_angles_and_torques_and_the_path_is_kept():
     assert max(run.along, run.across) < 0.005
 
 
+@pytest.mark.nightly
 def test_the_path_is_kept_where_the_others_creep_far_more_than_believed():
     """Four times the creep of the robot file's ground: the first test learns it, and odometry takes back what it missed.
 

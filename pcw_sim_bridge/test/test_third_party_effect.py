@@ -66,7 +66,7 @@ def test_it_is_listed(simulate):
     assert "stiffness [N m/rad]: torque per angle; 0 to 100, must be given" in listed
 
 
-@pytest.mark.parametrize("plant", ["reduced", "pybullet"])
+@pytest.mark.parametrize("plant", ["reduced", pytest.param("pybullet", marks=pytest.mark.nightly)])
 def test_it_is_at_work(simulate, tmp_path, plant):
     """Jacked up, the steering motor of that caster alone holds the spring: -stiffness times angle."""
     out = tmp_path / "bag"

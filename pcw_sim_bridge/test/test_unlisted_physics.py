@@ -531,3 +531,23 @@ def test_a_law_that_a_later_answer_does_without_is_not_told_and_gives_the_name_b
     assert judged.selection.fit.instances == (name, other)
     assert judged.result.leftovers == left.leftovers
     assert judged.withdrawn == ()
+
+
+def test_a_name_that_is_less_sure_for_a_law_that_is_not_told_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was half as sure, and nobody could see why."""
+    name = Instance(0, (), (0,))
+    terms = [SimpleNamespace(effect="friction", target=("drive_torque/left",), arguments=("speed",))]
+    search = SimpleNamespace(
+        problem=SimpleNamespace(sites=object(), terms=terms), label=lambda instance: "friction", progress=lambda said: None
+    )
+    selection = SimpleNamespace(fit=SimpleNamespace(instances=(name,)), threshold=3.0)
+    law = SimpleNamespace(sites=("drive_torque/left",), depends_on=("steer_angle/left",))
+    monkeypatch.setattr(open_set, "shared_beliefs", lambda search, selection: {})
+    said = "friction may stand for a law outside the library, drive_torque/left by steer_angle/left: 50 % as sure for that."
+    for belief, wanted in ((0.5, (said,)), (0.999, ())):
+        found = SimpleNamespace(law=law, counts=False, withdrawn=(name,), names=(), belief=belief)
+        monkeypatch.setattr(open_set, "LawSearch", lambda search, selection, found=found: SimpleNamespace(run=lambda: found))
+        left = open_set.OpenSetResult((), (), np.zeros(1))
+        judged = open_set.judge(search, selection, left)  # type: ignore[arg-type]
+        assert judged.beliefs == {0: belief}
+        assert judged.doubts == wanted

@@ -238,7 +238,10 @@ def _pooled(named: Sequence[NamedTerm]) -> NamedTerm | None:
 
 def _first_look(problem: RegressionProblem, settings: SelectionSettings | None) -> dict[str, float]:
     """What every candidate gains over noise as it is, by its effect [nats]."""
-    thinned = (dataclasses.replace(term, shapes=term.shapes[::FIRST_LOOK_STEP]) for term in problem.terms)
+    # Where times near the best one were chosen, none of the others may come near enough to be the effect as a whole.
+    thinned = (
+        term if term.grid_size else dataclasses.replace(term, shapes=term.shapes[::FIRST_LOOK_STEP]) for term in problem.terms
+    )
     problem = dataclasses.replace(problem, terms=tuple(thinned))
     search = EffectSearch(problem, np.random.default_rng(0), settings)
     # As white noise: a large effect would pass for slow noise here.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -43,9 +44,10 @@ PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
 # A dead time shows once it reaches into the last step of a cycle, or of one before, and as far as that step only in proportion
-# to how far: by these parts of a step, in so many cycles.
+# to how far: by these parts of a step, in the first cycles, and in those that are about as long ago as what does best.
 REACHES = (0.03, 0.08, 0.2, 0.5)
-CYCLES_BACK = 3
+FIRST_CYCLES = 3
+WORTH_A_LOOK = 0.9  # of the squares that a time leaves; above it, no others near it are tried
 CYCLES = 2  # so many different lengths of cycles are looked at: 3 and 4 ms at 300 Hz among steps of 1 ms
 # Torques at which a drive may give no more, by how much of the time more was asked of it.
 LARGEST_QUANTILES = (0.8, 0.95, 0.99, 0.999)
@@ -160,6 +162,7 @@ class _JointProblem:
         ]
         self._known = sorted(known, key=lambda instance: get(instance.name).stage)  # type: ignore[attr-defined]
         self._plain = self._torques(())
+        self._measured = np.concatenate([piece.torque for piece in pieces])
 
     def _torques(self, more: Sequence[EffectInstance]) -> FloatArray:
         """Torque of all pieces on end (T,) with the robot's own effects and more of them, each in its stage."""
@@ -176,7 +179,6 @@ class _JointProblem:
 
     def problem(self) -> RegressionProblem:
         """Return the regression problem."""
-        measured = np.concatenate([piece.torque for piece in self.pieces])
         lengths = [len(piece.time) for piece in self.pieces]
         return RegressionProblem(
             channels=(Channel(f"command_tracking/{self.caster}_{self.axis}", "N m", (self.caster,), self.axis),),
@@ -184,9 +186,9 @@ class _JointProblem:
             segment=np.repeat(np.arange(len(self.pieces)), lengths),
             recording=np.repeat([piece.recording for piece in self.pieces], lengths),
             rate=1.0 / self.pieces[0].interval,
-            measured=measured[:, None],
-            residual=(measured - self._plain)[:, None],
-            valid=np.ones((len(measured), 1), dtype=bool),
+            measured=self._measured[:, None],
+            residual=(self._measured - self._plain)[:, None],
+            valid=np.ones((len(self._measured), 1), dtype=bool),
             nuisances=tuple(self._nuisances()),
             terms=tuple(self._terms()),
             variables=self._variables(),
@@ -212,51 +214,68 @@ class _JointProblem:
         for effect in all_effects().values():
             if not isinstance(effect, ActuatorEffect) or self.axis not in (effect.axes or (effect.axis,)):
                 continue
-            shapes, resolution = self._grid(effect)
+            shapes, resolution, among = self._grid(effect)
             if shapes:
                 found.append(
                     Term(
                         effect=effect.name, target=(self.caster,), parameters=(PRESENCE,), shapes=shapes,
                         columns=functools.partial(self._column, effect), resolution=resolution, log_prior=effect.log_prior,
-                        axis=self.axis if effect.axes else None, arguments=("command", "velocity"),
+                        axis=self.axis if effect.axes else None, arguments=("command", "velocity"), grid_size=among,
                     )
                 )
         return found
 
-    def _grid(self, effect: ActuatorEffect) -> tuple[tuple[dict[str, float], ...], dict[str, tuple[str, float]]]:
-        """Numbers to try: times on a logarithmic scale, torques that were asked for, and speeds that were reached."""
+    def _grid(self, effect: ActuatorEffect) -> tuple[tuple[dict[str, float], ...], dict[str, tuple[str, float]], int]:
+        """Numbers to try: times on a logarithmic scale, torques that were asked for, and speeds that were reached.
+
+        Returns:
+            The numbers, what of them is searched between, and how many they were chosen from.
+        """
         defaults = {p.name: p.default for p in effect.parameters if p.default is not None}
         needed = [p for p in effect.parameters if p.default is None]
         if len(needed) != 1:
-            return (), {}
+            return (), {}, 0
         [first] = needed
         if first.unit == "s":
-            times = sorted((*TIMES, *self._reaching()))
-            return tuple({**defaults, first.name: float(t)} for t in times), {first.name: ("log", TIME_SPACING)}
+            left = [self._left({first.name: t, **defaults}, effect) for t in TIMES]
+            best = TIMES[int(np.argmin(left))]
+            times, among = {*TIMES, *self._reaching(0.0, 0.0)}, 0
+            near = {*self._reaching(best / TIME_SPACING, best * TIME_SPACING)}
+            if not near <= times and min(left) < WORTH_A_LOOK * float(np.sum((self._measured - self._plain) ** 2)):
+                times, among = times | near, len({*TIMES, *self._reaching(0.0, TIMES[-1])})
+            return tuple({**defaults, first.name: float(t)} for t in sorted(times)), {first.name: ("log", TIME_SPACING)}, among
         if first.unit != "N m":
-            return (), {}
-        command = np.abs(self._plain)
-        measured = np.abs(np.concatenate([piece.torque for piece in self.pieces]))
+            return (), {}, 0
+        command, measured = np.abs(self._plain), np.abs(self._measured)
         # A limit is a torque that was asked for, or the largest that came.
         torques = np.unique([*np.quantile(command, QUANTILES), *np.quantile(measured, LARGEST_QUANTILES)])
-        shapes = [{**defaults, first.name: float(t)} for t in torques if t > 0.0]
+        limits = [{**defaults, first.name: float(t)} for t in torques if t > 0.0]
         resolution = {first.name: ("log", 1.3)}
         if {"knee_speed", "no_load_speed"} <= set(defaults):
             top = float(np.max(np.abs(np.concatenate([piece.rate for piece in self.pieces]))))
             largest = 1.05 * float(command.max())
-            shapes += [
+            limits += [
                 {**defaults, first.name: largest, "knee_speed": part * top, "no_load_speed": (part + gap) * top}
                 for part in KNEES for gap in (0.3, 0.8, 2.0) if top > 0.0
             ]
-        return tuple(shapes), resolution
+        return tuple(limits), resolution, 0
 
-    def _reaching(self) -> list[float]:
-        """Times [s] that reach a little into the last step of one of the commonest cycles, or of several one after another."""
+    def _left(self, shape: Shape, effect: ActuatorEffect) -> float:
+        """Sum of squares that an effect leaves of the reported torque."""
+        return float(np.sum((self._measured - self._plain - self._column(effect, shape)[:, 0, 0]) ** 2))
+
+    def _reaching(self, shortest: float, longest: float) -> list[float]:
+        """Times [s] that reach a little into the last step of one of the commonest cycles, or of several one after another.
+
+        Of the first cycles, and of all that are from `shortest` to `longest` [s] ago.
+        """
         step, steps = max(self.pieces, key=lambda piece: len(piece.time)).steps
         lengths, counts = np.unique(steps, return_counts=True)
-        common = lengths[np.argsort(-counts, kind="stable")[:CYCLES]]
-        whole = sorted({int(length * back) for length in common for back in range(1, CYCLES_BACK + 1)})
-        return [float(step * (steps_back - 1 + part)) for steps_back in whole for part in REACHES]
+        whole: set[int] = set()
+        for length in lengths[np.argsort(-counts, kind="stable")[:CYCLES]].tolist():
+            near = range(math.ceil(shortest / (step * length)), math.ceil(longest / (step * length)) + 1)
+            whole |= {length * back for back in {*range(1, FIRST_CYCLES + 1), *near} if back > 0}
+        return [float(step * (steps_back - 1 + part)) for steps_back in sorted(whole) for part in REACHES]
 
     def _variables(self) -> dict[str, FloatArray]:
         return {

@@ -133,7 +133,7 @@ class Explanation:
         leftovers: dependences that nothing named explains, strongest first.
         withdrawn: names that a leftover explains better: (label, variable).
         refinement: a refined law that was not adopted; None if there is none, or if it was adopted.
-        remarks: what an adopted refinement changed, in plain sentences.
+        remarks: what an adopted refinement changed, and why names are less sure, in plain sentences.
         floor: rms of each channel that nothing measured explains (C,).
         p_values: of each channel holding noise and tolerances only (C,).
     """
@@ -213,7 +213,7 @@ def explain(
         leftovers=result.leftovers,
         withdrawn=judgement.withdrawn,
         refinement=suspect,
-        remarks=remarks,
+        remarks=(*remarks, *judgement.doubts),
         floor=result.floor,
         p_values=_p_values(search, selection, result),
     )

@@ -52,6 +52,7 @@ CLOSED_PART, SIMPLER_PART = 0.01, 0.05
 AGAINST_A_NAME = 3.0
 # What is left of the probability of a name that a curve of the same argument can hold to this part of its square.
 SHARED_BELIEF, HELD_PART = 0.5, 0.5
+WORTH_TELLING = 0.95  # what is left of a probability, above which nobody asks why
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Judgement:
         withdrawn: names that something left explains better: (label, variable).
         beliefs: what is left of the probability of names, by term, that a law not sure enough to be told would withdraw, or
             that a law beside them can hold.
+        doubts: the same in plain sentences.
     """
 
     search: EffectSearch
@@ -111,6 +113,7 @@ class Judgement:
     result: OpenSetResult
     withdrawn: tuple[tuple[str, str], ...]
     beliefs: Mapping[int, float]
+    doubts: tuple[str, ...]
 
 
 def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Judgement:
@@ -123,6 +126,7 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
     withdrawn: list[tuple[str, str]] = []
     found: list[tuple[Law, FoundLaw]] = []
     beliefs: dict[int, float] = {}
+    doubts: tuple[str, ...] = ()
     result: OpenSetResult | None = left
     for _ in range(LARGEST_LAWS if search.problem.sites is not None else 0):
         law = LawSearch(search, selection).run()
@@ -130,6 +134,7 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
             break
         if not law.counts:
             beliefs = {i.term: law.belief for i in law.withdrawn}
+            doubts = _doubts(search, law)
             break
         listed = _in_library(search, selection, law)
         if listed is not None:
@@ -156,10 +161,24 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
     for label, variable in withdrawn:
         search.progress(f"withdrawn: {label}, the residual depends on {variable}")
     laws = [_law_leftover(search, selection, law, how) for law, how in found if _is_fitted(search, selection, law)]
-    beliefs |= shared_beliefs(search, selection)
+    shared = shared_beliefs(search, selection)
+    doubts += tuple(
+        f"How much of it is {search.label(i)}, and how much the law beside it, no recording tells: half as sure for that."
+        for i in selection.fit.instances if i.term in shared
+    )  # fmt: skip
+    beliefs |= shared
     return Judgement(
-        search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs
+        search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs, doubts
     )
+
+
+def _doubts(search: EffectSearch, found: FoundLaw) -> tuple[str, ...]:
+    """What a law that is not sure enough to be told takes from the names in whose place it would do."""
+    if not found.withdrawn or found.belief > WORTH_TELLING:
+        return ()
+    names = " and ".join(search.label(instance) for instance in found.withdrawn)
+    law = f"{' and '.join(found.law.sites)} by {', '.join(found.law.depends_on)}"
+    return (f"{names} may stand for a law outside the library, {law}: {100 * found.belief:.0f} % as sure for that.",)
 
 
 def is_unknown(problem: RegressionProblem, instance: Instance) -> bool:
