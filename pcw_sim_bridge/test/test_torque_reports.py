@@ -179,12 +179,9 @@ def test_no_factor_of_all_torques_and_masses_takes_errors_away(tmp_path: Path) -
     assert unexplained([*masses, *gains]) > 0.75 * unexplained(masses)
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 @pytest.mark.parametrize(
-    ("name", "controller", "mass"),
-    [
-        pytest.param("flow_base", "velocity_loops", 5.0, marks=pytest.mark.nightly),
-        pytest.param("tidybot2", "computed_torque", 15.0, marks=pytest.mark.nightly),
-    ],
+    ("name", "controller", "mass"), [("flow_base", "velocity_loops", 5.0), ("tidybot2", "computed_torque", 15.0)]
 )
 def test_a_payload_is_no_weakness_of_all_motors(tmp_path: Path, name: str, controller: str, mass: float) -> None:
     """A fit that makes all torques and masses smaller makes all errors smaller, too, and would be preferred for that."""

@@ -300,7 +300,7 @@ class EffectSearch(SetGrowth):
         self, selection: Selection, others: tuple[Instance, ...], rival: int, least: float
     ) -> tuple[Selection, float]:
         """A smaller set with another term, from where nothing was named on, and its log odds; the old one if below `least`."""
-        here = self.problem, self._point
+        here, odds = (self.problem, self._point), -math.inf
         self.problem, self._point = self.unexplained
         regression = self.whiten_beside(others)
         candidates = regression.scan(others, only=[rival])[0]
@@ -319,10 +319,8 @@ class EffectSearch(SetGrowth):
             self.progress(f"{said} instead, from the beginning: log odds {odds:.1f}")
             if odds > least and any(found.term == rival for found in instead.fit.instances):
                 return instead, odds
-            self.problem, self._point = here
-            return selection, odds
         self.problem, self._point = here
-        return selection, -math.inf
+        return selection, odds
 
     def against_alike(self, selection: Selection) -> Selection:
         """Exchange an effect for one that does the same to first order, where that one does more when both are exact."""

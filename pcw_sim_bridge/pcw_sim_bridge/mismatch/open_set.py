@@ -163,7 +163,7 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
     laws = [_law_leftover(search, selection, law, how) for law, how in found if _is_fitted(search, selection, law)]
     shared = shared_beliefs(search, selection)
     doubts += tuple(
-        f"How much of it is {search.label(i)}, and how much the law beside it, no recording tells: half as sure for that."
+        f"{search.label(i)} and the law beside it do the same: which part is which no recording tells; half as sure for that."
         for i in selection.fit.instances if i.term in shared
     )  # fmt: skip
     beliefs |= shared
