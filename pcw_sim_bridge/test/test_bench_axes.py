@@ -121,6 +121,7 @@ def test_cogging_of_a_brushless_motor_has_its_orders(odrive: Findings) -> None:
     assert all(low < 0.3 * high for high, low in [odrive.fit.inverse_nrmse])
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 def test_a_motor_with_its_cogging_in_the_description_has_nothing_more(odrive: Findings) -> None:
     """What was found on one recording, put under `physics`, leaves nothing to name."""
     known = tuple(

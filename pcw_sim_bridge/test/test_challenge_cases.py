@@ -331,9 +331,8 @@ def test_a_case_is_drawn_until_a_robot_can_be_driven_so(
         assert prepare_case(order)["number"] == drawn
 
 
-@pytest.mark.parametrize(
-    "masking", [pytest.param(m, marks=() if m == "retuned" else pytest.mark.nightly) for m in MASKINGS]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("masking", MASKINGS)
 def test_masked_cases_are_masked(masking: str) -> None:
     orders = order_cases(16, 2, kinds=("masked",), plants=("reduced",), durations=(15.0, 16.0))
     answer = prepare_case(next(order for order in orders if order.masking == masking))

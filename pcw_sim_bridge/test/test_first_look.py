@@ -97,9 +97,8 @@ CONCEALED = [
 ]
 
 
-@pytest.mark.parametrize(
-    "entry", [CONCEALED[0], pytest.param(CONCEALED[1], marks=pytest.mark.nightly)], ids=lambda entry: str(entry["name"])
-)
+@pytest.mark.nightly  # a whole analysis, like that of others here
+@pytest.mark.parametrize("entry", CONCEALED, ids=lambda entry: str(entry["name"]))
 def test_what_comes_once_is_named_with_its_time_or_place(entry: dict[str, object], tmp_path: Path) -> None:
     excitation = make_excitation("identification", THESIS, 25.0, 11)
     true = dataclasses.replace(THESIS, physics=read_physics([entry], THESIS.caster_names))

@@ -230,6 +230,7 @@ def test_sensors_that_only_some_recordings_have_are_refused_and_missing_ones_tol
     assert "forces could not be judged" in (tmp_path / "report" / "report.html").read_text()
 
 
+@pytest.mark.nightly  # two whole analyses
 def test_same_seed_same_report(tmp_path: Path) -> None:
     """A sled with friction is found out, and twice the same way."""
     (tmp_path / "sled.yaml").write_text(LINEAR_AXIS)

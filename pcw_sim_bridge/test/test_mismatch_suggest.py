@@ -89,14 +89,12 @@ def test_a_doubt_is_settled_by_what_the_report_leads_to(
     assert "excitation.yaml: exists already" in capsys.readouterr().err
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 @pytest.mark.parametrize(
     ("first", "second"),
     [
         (effect(name="drive_viscous_friction", target=ALL, viscous=0.03), "drive_coulomb_friction"),
-        pytest.param(
-            effect(name="ground_slope", target=["chassis"], angle=0.02, direction=0.5), "constant_load",
-            marks=pytest.mark.nightly,
-        ),
+        (effect(name="ground_slope", target=["chassis"], angle=0.02, direction=0.5), "constant_load"),
     ],
     ids=lambda value: value if isinstance(value, str) else value.name,
 )

@@ -177,7 +177,7 @@ def test_rotors_of_coupled_gears_are_wrong_at_both_joints(rotor: str) -> None:
     [
         pytest.param("wheel.inertia_axle", marks=pytest.mark.nightly),
         pytest.param("module.mass", marks=pytest.mark.nightly),
-        "contact.stiffness",
+        pytest.param("contact.stiffness", marks=pytest.mark.nightly),
         "drive_coulomb_friction",
     ],
 )
@@ -394,13 +394,12 @@ def test_wheels_that_climb_slip_no_more_for_it(tmp_path: Path) -> None:
     assert np.all(left[1][3:11] < left[0][3:11] / 3.0), "0.4 to 0.9 of it if the push were a tyre's"
 
 
+@pytest.mark.nightly  # two runs in an engine of three dimensions
 @pytest.mark.parametrize(
     "entry",
     [
         {"name": "uneven_ground", "target": [*THESIS.caster_names], "amplitude": 0.0015, "wavelength": 1.3, "direction": 0.7},
-        pytest.param(
-            {"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 6e4}, marks=pytest.mark.nightly
-        ),
+        {"name": "tyre_radial_compliance", "target": ["front_left"], "stiffness": 6e4},
     ],
     ids=lambda entry: str(entry["name"]),
 )

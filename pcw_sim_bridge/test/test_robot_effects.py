@@ -21,7 +21,6 @@ from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS, DYROS = load_robot("thesis"), load_robot("dyros_pcv")
-NIGHTLY = pytest.mark.nightly
 CONCEALED = [
     ("pybullet", {"name": "wheel_radius_error", "target": ["front_left"], "error": 1.0e-3}),
     ("reduced", {"name": "wheel_radius_error", "target": [*THESIS.caster_names], "error": 1.5e-3}),
@@ -40,7 +39,7 @@ CONCEALED = [
 ]
 
 
-@NIGHTLY  # a whole analysis each; `mismatch analyze` of one robot is tried daily
+@pytest.mark.nightly  # a whole analysis each; `mismatch analyze` of one robot is tried daily
 @pytest.mark.parametrize(("plant", "entry"), CONCEALED, ids=lambda value: value["name"] if isinstance(value, dict) else value)
 def test_a_concealed_effect_is_named_with_its_numbers(plant: str, entry: dict[str, object], tmp_path: Path) -> None:
     """One run of the excitation that tells effects apart best; the patch brings the held-out channels nearer."""
@@ -81,17 +80,18 @@ def test_on_a_slope_the_direction_comes_from_the_turning(tmp_path: Path) -> None
     assert effect.parameters["direction"].value == pytest.approx(-2.0, abs=0.1)  # not 4.28, which is the same
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 @pytest.mark.parametrize(
     ("plant", "seed", "entry", "within"),
     [
         # The description's own number of this tyre takes the effect in, and comes out many tolerances off.
         ("reduced", 5, {"name": "tyre_lateral_stiffness", "target": ["rear_left"], "error": -0.5}, 0.05),
         # Two of these steerings do not turn once: no wave over their own angle can be told, but one that is there for all.
-        pytest.param("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
-                                     "cosine": 0.03, "sine": -0.02}, 0.001, marks=NIGHTLY),
+        ("pybullet", 3, {"name": "motor_cogging", "target": [*THESIS.caster_names], "axis": "steer", "order": 7.0,
+                         "cosine": 0.03, "sine": -0.02}, 0.001),
         # A steering that turns one way here and the other way there leaves a torque by its angle where that is not named.
-        pytest.param("reduced", 1, {"name": "steer_coulomb_friction", "target": ["front_left"], "coulomb": 0.4,
-                     "asymmetry": -0.15}, 0.003, marks=NIGHTLY),
+        ("reduced", 1, {"name": "steer_coulomb_friction", "target": ["front_left"], "coulomb": 0.4,
+                         "asymmetry": -0.15}, 0.003),
     ],
     ids=["a tyre behind its own number", "coggings of all as one", "a friction by direction behind an angle"],
 )  # fmt: skip
@@ -109,7 +109,7 @@ def test_what_hid_is_named(plant: str, seed: int, entry: dict[str, object], with
         assert found.low < true < found.high
 
 
-@NIGHTLY
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("entry", "within"),
     [

@@ -127,7 +127,8 @@ def test_errors_of_torques_are_told_by_the_balance_of_forces(tmp_path: Path) -> 
     assert error(by_reports.balanced_torque) < 0.7 * error(by_reports.quiet_torque)
 
 
-@pytest.mark.parametrize("excitation", [pytest.param("figure8", marks=pytest.mark.nightly), "identification"])
+@pytest.mark.nightly  # a whole analysis, like that of others here
+@pytest.mark.parametrize("excitation", ["figure8", "identification"])
 def test_a_healthy_robot_whose_drives_hold_speeds_lacks_nothing(tmp_path: Path, excitation: str) -> None:
     """Torques read once a cycle, always before the next command: less than what was given by a part of what accelerates."""
     findings = found_in(run(FLOW_BASE, "velocity_loops", tmp_path, excitation, 40.0))

@@ -165,15 +165,13 @@ def analysed(path: Path, *held_out: Path) -> Analysis:
     return analyse(RobotSubject(THESIS), [path], held_out, {}, 0, lambda message: None)
 
 
+@pytest.mark.nightly  # a whole analysis, like that of others here
 @pytest.mark.parametrize(
     ("law", "channel", "leading", "known"),
     [
         (friction_by_steering, "drive_torque/front_right", "steer_angle/front_right", "cos(steer_angle/front_right)"),
-        pytest.param(fading_torque, "drive_torque/rear_left", "time", "exp(-time /", marks=pytest.mark.nightly),
-        pytest.param(
-            coupling, "drive_torque/front_left", "drive_velocity/front_left", "front_left - drive_velocity/rear_right",
-            marks=pytest.mark.nightly,
-        ),
+        (fading_torque, "drive_torque/rear_left", "time", "exp(-time /"),
+        (coupling, "drive_torque/front_left", "drive_velocity/front_left", "front_left - drive_velocity/rear_right"),
     ],
 )  # fmt: skip
 def test_it_is_said_so_with_the_leading_variable_and_no_name(law, channel, leading, known, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from scipy import signal
 
-from pcw_description.compiled import ARRAY_SIGNATURE, compiled_for_kernel
+from pcw_description.compiled import ARRAY_SIGNATURE, compiled, compiled_for_kernel
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.effect import Effect
 from pcw_description.effects.kinds import (
@@ -307,13 +307,19 @@ def _contacts_along(kernel, values, time, place, roll_angle, load):  # type: ign
     return found
 
 
-def _between_samples(rows: FloatArray) -> FloatArray:
-    """Return what lies about the samples of rows (T, K), (T * BETWEEN_SAMPLES, K), as many to either side of each."""
-    way = (np.arange(BETWEEN_SAMPLES) + 0.5) / BETWEEN_SAMPLES - 0.5
-    places = np.clip(np.arange(len(rows))[:, None] + way, 0.0, len(rows) - 1.0).ravel()
-    first = np.minimum(places.astype(np.int64), max(len(rows) - 2, 0))
-    part = (places - first)[:, None]
-    return (1.0 - part) * rows[first] + part * rows[np.minimum(first + 1, len(rows) - 1)]
+@compiled
+def _between_samples(rows):  # type: ignore[no-untyped-def]
+    """Return what lies about the samples of signals (K, T), (K, T * BETWEEN_SAMPLES), as many to either side of each."""
+    count = rows.shape[1]
+    between = np.empty((len(rows), count * BETWEEN_SAMPLES))
+    for i in range(len(rows)):
+        for t in range(count):
+            # Before the first sample and after the last one lies that sample.
+            earlier, later = rows[i, t] - rows[i, max(t - 1, 0)], rows[i, min(t + 1, count - 1)] - rows[i, t]
+            for k in range(BETWEEN_SAMPLES):
+                way = (k + 0.5) / BETWEEN_SAMPLES - 0.5
+                between[i, t * BETWEEN_SAMPLES + k] = rows[i, t] + way * (earlier if way < 0.0 else later)
+    return between
 
 
 def torque_along(
@@ -331,7 +337,7 @@ def torque_along(
     """
     if "position" not in kernel_arguments(effect.name):
         return torque(*signals)
-    fine = torque(*_between_samples(np.stack(signals, axis=1)).T)
+    fine = torque(*_between_samples(np.stack(signals)))
     taps = signal.firwin(RIPPLE_TAPS, RIPPLE_CUTOFF, fs=BETWEEN_SAMPLES)
     # The middle of an even number of taps lies between two values, as a sample lies between those about it.
     first = (RIPPLE_TAPS + BETWEEN_SAMPLES) // 2 - 1
@@ -493,7 +499,7 @@ class ChannelModel:
         """Change both sides as an effect on forces, gravity, IMU or clocks does; other kinds change nothing here."""
         layout = self.layout
         if isinstance(effect, ChassisForceEffect) and layout.balanced:
-            wrench = effect.contribution(_between_samples(_at(motion, numbers)), values)
+            wrench = effect.contribution(_between_samples(np.ascontiguousarray(_at(motion, numbers).T)).T, values)
             measured[:, :3] += wrench[:, [0, 1, 5]].reshape(-1, BETWEEN_SAMPLES, 3).mean(axis=1)
         elif isinstance(effect, GravityEffect):
             self.lean(motion, numbers, effect.gravity(values), measured, predicted)
