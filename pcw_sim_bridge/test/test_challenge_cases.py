@@ -244,7 +244,6 @@ def test_what_a_healthy_robot_may_differ_by_costs_what_its_tolerances_say(
 def test_what_no_healthy_robot_has_costs_more_than_any_tolerance() -> None:
     assert tolerated_cost(THESIS, EffectInstance("fading_torque", THESIS.caster_names, {"size": 1e-4})) == np.inf
     assert tolerated_cost(THESIS, effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": 1e-4})) == np.inf
-    assert tolerated_cost(THESIS, effect_instance("payload_offset", ("chassis",), {"x": 1e-4, "y": 0.0, "z": 0.1})) == np.inf
     angle = 2.0 * THESIS.tolerance("ground.slope").value
     slope = effect_instance("ground_slope", ("chassis",), {"angle": angle, "direction": 2.0})
     assert tolerated_cost(THESIS, slope) == pytest.approx(2.0)
@@ -329,6 +328,14 @@ def test_a_case_is_drawn_until_a_robot_can_be_driven_so(
             prepare_case(order)
     else:
         assert prepare_case(order)["number"] == drawn
+
+
+def test_a_payload_costs_what_it_moves_of_mass_and_its_centre() -> None:
+    """One of a hundredth of the chassis, a metre above it, moves that by a centimetre: two tolerances."""
+    chassis = THESIS.chassis
+    payload = {"mass": 0.01 * chassis.mass, "x": chassis.com[0], "y": chassis.com[1], "z": chassis.com[2] + 1.0}
+    cost = tolerated_cost(THESIS, effect_instance("payload_mass", ("chassis",), payload))
+    assert cost == pytest.approx(0.5 * (1.0 + (1.0 / 1.01 / 100.0 / 0.005) ** 2))
 
 
 @pytest.mark.nightly

@@ -467,6 +467,31 @@ def test_a_cogging_turns_with_the_wheel_and_not_with_what_is_read_of_it(tmp_path
     ) == pytest.approx(problem.columns(place, size.shape))
 
 
+def test_an_imu_that_reads_too_much_reads_too_much_of_a_leaning_floor_too(tmp_path: Path) -> None:
+    """A slow robot felt little else: what its floor added went for slow noise, in which the error was lost."""
+
+    def slow(time: float) -> np.ndarray:
+        return np.array([0.3, 0.3, 1.0]) * wandering(time)
+
+    record_run(THESIS, slow, DURATION, 3, tmp_path / "run")
+    problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / "run", THESIS)]).build()
+    place = [term.key for term in problem.terms].index("imu_scale/imu")
+    names = [parameter.name for parameter in problem.terms[place].parameters]
+    size = SizedTerm(place, (), np.array([0.8 * (name == "accelerometer_y") for name in names]), (0, 1, 2))
+    leaning = {"ground.slope.x": 0.003, "ground.slope.y": -0.002}
+    assert problem.exact is not None
+    (without, _), (with_it, _) = (problem.exact(leaning, sizes) for sizes in ([], [size]))  # type: ignore[misc]
+    works = np.where(problem.valid, without - with_it, 0.0)
+    apart = []
+    for level in (problem, problem.with_headings(leaning)):
+        columns = level.columns(place, ()) @ size.coefficients
+        apart.append(np.linalg.norm(np.where(problem.valid, columns, 0.0) - works) / np.linalg.norm(works))
+    print("apart", apart)
+    assert apart[0] > 0.1
+    assert apart[1] < 0.02
+    assert problem.with_headings({"ground.slope.x": 1e-4}).terms[place] is problem.terms[place]
+
+
 def test_a_tyre_near_its_peak_is_not_asked_how_much_it_slips() -> None:
     """Of four wheels one uses nine tenths of what it can; of a floor that gives more it uses less."""
     numbers = ModelNumbers.of(THESIS)

@@ -72,10 +72,13 @@ class ChannelDifferences:
             pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
         return self.filtered(pieces)
 
-    def of_effect(self, instance: EffectInstance) -> FloatArray:
-        """What an effect adds to the residual, (T, C)."""
+    def of_effect(self, instance: EffectInstance, lean: FloatArray | None = None) -> FloatArray:
+        """What an effect adds to the residual, (T, C); lean: of gravity by so much (3,) in what the IMU senses."""
         pieces = []
         for motion, around, plain in zip(self.motions, self._around, self._sides, strict=True):
+            if lean is not None:
+                plain = plain[0].copy(), plain[1].copy()
+                self.model.lean(motion, self.model.numbers, lean, *plain)
             measured, predicted = self.model.sides_with(motion, around, plain, instance)
             pieces.append(np.nan_to_num((plain[0] - plain[1]) - (measured - predicted)))
         return self.filtered(pieces)

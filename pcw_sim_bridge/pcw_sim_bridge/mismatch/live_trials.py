@@ -122,12 +122,12 @@ def within_tolerance(robot: RobotDescription, rng: np.random.Generator) -> Robot
         return float(known.value * (abs(nominal) if known.relative else 1.0) * rng.normal())
 
     chassis = robot.chassis
-    com = (chassis.com[0] + drawn("chassis.com"), chassis.com[1] + drawn("chassis.com"), chassis.com[2])
+    x, y, z = (c + drawn("chassis.com") for c in chassis.com)
     changed = dataclasses.replace(
         chassis,
         mass=chassis.mass + drawn("chassis.mass", chassis.mass),
         inertia_zz=chassis.inertia_zz + drawn("chassis.inertia_zz", chassis.inertia_zz),
-        com=com,
+        com=(x, y, z),
     )
     physics = [
         _effect("ground_slope", "chassis", angle=abs(drawn("ground.slope")), direction=float(rng.uniform(-np.pi, np.pi)))

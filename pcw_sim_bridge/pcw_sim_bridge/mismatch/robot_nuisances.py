@@ -255,6 +255,8 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
     yield "chassis.mass", "chassis.mass", robot.chassis.mass, _entry("chassis", 0)
     yield "chassis.com", "chassis.com.x", 0.0, _entry("chassis", 1)
     yield "chassis.com", "chassis.com.y", 0.0, _entry("chassis", 2)
+    # By which loads move from wheel to wheel when the robot accelerates, and with them what the tyres give way.
+    yield "chassis.com", "chassis.com.z", 0.0, _entry("com_height")
     yield "chassis.inertia_zz", "chassis.inertia_zz", robot.chassis.inertia_zz, _entry("chassis", 3)
     for label, column, nominal in (
         ("module.mass", 0, first.module.mass),

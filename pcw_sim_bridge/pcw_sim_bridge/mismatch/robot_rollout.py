@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pcw_description.contact.contact_model import LENGTH
 from pcw_description.effects.kinds import ActuatorEffect, EncoderEffect
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
@@ -16,18 +17,28 @@ from ..plants.reduced import ReducedPlant, WindowStarts
 from ..plants.true_robot import as_it_really_is
 from .regression_problem import FloatArray, IntArray
 from .robot_channels import STILL_SPEED, sliding
-from .robot_effects import true_motion, with_pose
+from .robot_effects import ChannelModel, true_motion, with_pose
 from .robot_motion import LARGEST_CUTOFF, RobotMotion, read_motions
-from .rolling_model import ChannelLayout, ModelNumbers, twists, weights_on_steerings
+from .rolling_model import (
+    ChannelLayout,
+    ModelNumbers,
+    rigid_motions,
+    rolling_state,
+    slip_ratios,
+    slips,
+    twists,
+    weights_on_steerings,
+)
 from .rollout import HORIZONS, Windows, rows_of, window_rows
 from .signal_filter import SignalFilter, derivative, white_noise_level
 
 SIGNALS = ("v_x", "v_y", "omega", "drive_velocity", "steer_velocity", "x", "y", "yaw")
 STEP = 1e-3  # [s], at most
-# Before a window begins, tyres take up their forces and actuators fill their memories for so long [s]: soft tyres, and such
-# that have to roll for their forces, need some tenths of a second. By then joints would be elsewhere than they were measured.
+# Before a window begins, gears wind up and actuators fill their memories for so long [s]. By then joints would be elsewhere
+# than they were measured.
 LEAD = 0.5
 SETTINGS = 5  # times in the lead that the motion is set as it was measured
+SLOWEST_SLIP = 15.0  # [Hz]; what forces do faster is more noise of torques and accelerations than slip of tyres
 CUTOFF_SHARE = 8.0  # sampling rate over the largest cut-off; motions and torques shall be as sharp as they can be
 NOISE_SAMPLES = 8000  # of a signal that its noise is taken from
 
@@ -84,13 +95,17 @@ class Undescribed:
         unreported = [[retuned.get(f"torque_report.{axis}{kind}", 0.0) for kind in ("", "_behind")] for axis in AXIS_NAMES]
         return cls(np.array(unreported), retuned.get("torque_lag", 0.0), np.array(lean), np.array(detuning))
 
+    def among(self, numbers: ModelNumbers) -> ModelNumbers:
+        """All numbers of a model, these and those of its description."""
+        return dataclasses.replace(
+            numbers, unreported=self.unreported, torque_lag=self.torque_lag, lean=self.lean, detuning=self.detuning
+        )
+
     def torque(self, motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:
         """Torques (T, n, 2) that acted on a robot whose chassis does not lean [N m]."""
         given = motion.torque + self.torque_lag * motion.torque_rate + np.sum(self.unreported * motion.loops, axis=3)
         if self.lean.any() or self.detuning.any():
-            given[:, :, STEER] += weights_on_steerings(
-                motion, dataclasses.replace(numbers, lean=self.lean, detuning=self.detuning)
-            )
+            given[:, :, STEER] += weights_on_steerings(motion, self.among(numbers))
         return given
 
 
@@ -255,16 +270,32 @@ def _simulated(robot: RobotDescription, part: RobotPart, undescribed: Undescribe
     rows, _ = rows_of(part.starts - lead, np.arange(lead + last), len(motion.time))
     set_at = np.round(np.linspace(0, lead, SETTINGS + 1)).astype(np.int64)
     first = part.starts[:, None] - lead + set_at
-    twist = wheel_twist(own, motion.position[..., STEER], motion.velocity)
+    twist, relaxed_slip = _rolling(robot, undescribed.among(own), motion)
     starts = WindowStarts(
-        set_at, motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first]
-    )
+        set_at, motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first],
+        relaxed_slip[first],
+    )  # fmt: skip
     # A row is held until the next: what acts meanwhile is the mean of both.
     given = undescribed.torque(motion, own)
     torque = 0.5 * (given[rows] + given[np.minimum(rows + 1, len(motion.time) - 1)])
     bodies, joints = plant.roll_out(torque, substeps, starts, [lead + mark for mark in part.marks])
     position, velocity = _read(robot, joints[..., 0, :], joints[..., 1, :])
     return _signals(part, position, velocity, bodies[..., :3])
+
+
+def _rolling(robot: RobotDescription, numbers: ModelNumbers, motion: RobotMotion) -> tuple[FloatArray, FloatArray]:
+    """Twist of base_link (T, 3), slip of the wheels left out, and relaxed slip of the tyres (T, n, 2) [m] along a motion.
+
+    By the forces that the motion and its torques ask for. Left to a simulation, tyres that have to roll for their forces
+    would take up those of long ago: a robot at walking pace takes seconds for the relaxation length of a soft one.
+    """
+    layout = ChannelLayout(robot.caster_names, balanced=True, imu=False, pose=False)
+    state = rolling_state(motion, numbers, layout, ChannelModel(robot, numbers, layout).around(motion))
+    wheels, slow = state.wheels, SignalFilter(motion.rate, SLOWEST_SLIP)
+    slip = slips(numbers, motion.rate, wheels.speed, state.force, state.grip)
+    slip_twist, _ = rigid_motions(numbers, wheels.steer_angle, wheels.direction, slip, wheels.offset)
+    relaxed = numbers.tyres[:, LENGTH, None] * slip_ratios(numbers.tyres, state.force, state.grip)
+    return wheels.twist - slow.smooth(slip_twist), slow.smooth(relaxed)
 
 
 def _read(robot: RobotDescription, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -245,7 +245,9 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
     """
     chassis = robot.chassis
     x, y, z = chassis.com
-    com = (x + retuned.get("chassis.com.x", 0.0), y + retuned.get("chassis.com.y", 0.0), z)
+    com = (
+        x + retuned.get("chassis.com.x", 0.0), y + retuned.get("chassis.com.y", 0.0), z + retuned.get("chassis.com.z", 0.0)
+    )
     chassis = dataclasses.replace(
         chassis,
         mass=_positive(retuned.get("chassis.mass", chassis.mass), chassis.mass),

@@ -23,6 +23,7 @@ from pcw_description.effects.kinds import (
     ContactEffect,
     DescriptionEffect,
     EncoderEffect,
+    ImuEffect,
     JointTorqueEffect,
     TransmissionEffect,
 )
@@ -36,11 +37,13 @@ from .composed_columns import Columns, Placed, Turning, frozen
 from .first_look import Chosen, ChosenShapes, Looked, common_orders, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term
 from .robot_effects import torque_along
+from .robot_nuisances import FLOOR
 
 DIRECTIONS = 8  # of a grid over all directions
 HEIGHTS = 0.5  # of the typical height, the distance of neighbours
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 TURNED = 0.3  # [rad], of a ripple's phase, by a zero of the steering that was re-tuned; less is a detail
+LEANING = 2e-4  # [rad], of a floor that was re-tuned; what it adds to an accelerometer is lost in the noise of most
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
@@ -246,8 +249,8 @@ class _TermMaker:
 
         own = np.full(len(looked.time), True) if recording is None else looked.recording == recording
 
-        def columns(shape: Shape, names: Sequence[str]) -> FloatArray:
-            found = np.stack([self._difference(effect, target, axis, shape, neutral, name) for name in names], axis=2)
+        def columns(shape: Shape, names: Sequence[str], lean: FloatArray | None = None) -> FloatArray:
+            found = np.stack([self._difference(effect, target, axis, shape, neutral, name, lean) for name in names], axis=2)
             return np.where(own[:, None, None], found, 0.0)
 
         everything = columns(shapes[0], [p.name for p in searched])
@@ -258,6 +261,12 @@ class _TermMaker:
         names = [p.name for p in shown]
         remembered = _once_more(shapes[0], everything[:, :, seen], lambda shape: columns(shape, names))
         turning = next((p.name for p in effect.parameters if p.name in chosen.resolution and p.is_direction), None)
+
+        def leaning(changes: Mapping[str, float]) -> Columns | None:
+            lean = np.array([*(changes.get(name, 0.0) for name in FLOOR), 0.0])
+            if np.abs(lean).max() < LEANING:
+                return None
+            return lambda shape: columns(shape, names, lean)
 
         return Term(
             effect=effect.name,
@@ -283,6 +292,7 @@ class _TermMaker:
             unlike_errors="play" in names or (isinstance(effect, EncoderEffect) and turning is not None),
             once=look in ("windows", "patches"),
             recording=recording,
+            headed=leaning if isinstance(effect, ImuEffect) else None,
         )
 
     def _blur_of_times(self) -> dict[str, float]:
@@ -345,12 +355,13 @@ class _TermMaker:
         return dataclasses.replace(found, shapes=tuple({**rest, **shape} for shape in found.shapes))
 
     def _difference(
-        self, effect: Effect, target: tuple[str, ...], axis: str | None, at: Shape, neutral: Mapping[str, float], name: str
+        self, effect: Effect, target: tuple[str, ...], axis: str | None, at: Shape, neutral: Mapping[str, float], name: str,
+        lean: FloatArray | None = None,
     ) -> FloatArray:
-        """Column (T, C) of one parameter of an effect, the others as in `at` or neutral."""
+        """Column (T, C) of one parameter of an effect, the others as in `at` or neutral; lean: see `of_effect`."""
         step, value = _step(effect.parameter(name), neutral[name])
         values = {p.name: 0.0 for p in effect.searched_parameters} | {**at, **neutral, name: value}
-        return self.differences.of_effect(EffectInstance(effect.name, target, values, axis)) / step
+        return self.differences.of_effect(EffectInstance(effect.name, target, values, axis), lean) / step
 
     def _put_together(
         self, columns: Columns, chosen: ChosenShapes, turning: str | None

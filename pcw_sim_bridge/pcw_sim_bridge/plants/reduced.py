@@ -31,7 +31,6 @@ import numpy as np
 
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import scrub_torque, slip_under_load, tyre_step_with_slopes
-from pcw_description.differential_kinematics import forward_kinematics_kernel
 from pcw_description.effects.kinds import (
     CONTACT_RESULTS,
     FORCE_INPUTS,
@@ -345,13 +344,12 @@ def _rigid_motors(effects, position, velocity):  # type: ignore[no-untyped-def]
 
 @compiled
 def _roll_out(  # type: ignore[no-untyped-def]
-    steps, dt, chassis, casters, gravity, effects, torque, marks, set_at, time, pose, twist, position, velocity, bodies, joints
+    steps, dt, chassis, casters, gravity, effects, torque, marks, set_at, time, pose, twist, position, velocity, relaxed_slip,
+    bodies, joints,
 ):
     """Fill bodies (W, K, 6) and joints (W, K, n, 4) of `ReducedPlant.roll_out`; False if a torque is not finite."""
     windows, rows, n, _ = torque.shape
-    body, wheels, restart = np.empty(10), np.empty((n, WHEEL_STATE)), np.empty(3)
-    axis, offset = casters[:, SX : SY + 1].copy(), casters[:, BX : BY + 1].copy()
-    radius = casters[:, RADIUS].copy()
+    body, wheels = np.empty(10), np.empty((n, WHEEL_STATE))
     for w in range(windows):
         body[:] = 0.0
         wheels[:] = 0.0
@@ -363,16 +361,13 @@ def _roll_out(  # type: ignore[no-untyped-def]
         mark, setting = 0, 1
         for row in range(rows + 1):
             if setting < len(set_at) and row == set_at[setting]:
-                rolled, _, _ = forward_kinematics_kernel(
-                    axis, offset, radius, wheels[:, PHI].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
-                )
-                restart[:] = twist[w, setting] + body[_VX : _OMEGA + 1] - rolled
                 body[_X : _YAW + 1] = pose[w, setting]
+                wheels[:, ZX : ZY + 1] = relaxed_slip[w, setting]
                 # Gears stay wound up as the lead left them.
                 wound = effects.gear_state[:, :, : RATE + 1].copy()
                 _rigid_motors(effects, wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy())
                 wound -= effects.gear_state[:, :, : RATE + 1]
-                _set_motion(body, wheels, effects, restart, position[w, setting], velocity[w, setting])
+                _set_motion(body, wheels, effects, twist[w, setting], position[w, setting], velocity[w, setting])
                 effects.gear_state[:, :, : RATE + 1] += wound
                 setting += 1
             if mark < len(marks) and row == marks[mark]:
@@ -399,8 +394,10 @@ class WindowStarts:
         rows: after the first at which the motion is set (A,), increasing, the first 0.
         time: of the first row (W,) [s].
         pose: (W, A, 3) of base_link in the world.
-        twist: (W, A, 3) of base_link as its rolling wheels have it.
+        twist: (W, A, 3) of base_link, slip of the wheels left out.
         position, velocity: of the joints (W, A, n, 2).
+        relaxed_slip: of the tyres (W, A, n, 2) [m], as they stand under their forces; with the first row they land, and have
+            none.
     """
 
     rows: IntArray
@@ -409,6 +406,7 @@ class WindowStarts:
     twist: FloatArray
     position: FloatArray
     velocity: FloatArray
+    relaxed_slip: FloatArray
 
 
 class ReducedPlant:
@@ -503,8 +501,7 @@ class ReducedPlant:
     ) -> tuple[FloatArray, FloatArray]:
         """Drive many short windows with recorded torques, compiled as one; the plant is at its reset state afterwards.
 
-        Where the motion is set again, what the wheels slipped by is kept: until then tyres take up their forces and
-        actuators fill their memories.
+        Where the motion is set again, gears stay wound up, and actuators keep their memories.
 
         Args:
             torque: motor torques (W, L, n, 2) [N m], each row held for `steps` steps.
@@ -524,7 +521,7 @@ class ReducedPlant:
         fine = _roll_out(
             steps, self.dt, self._chassis, self._casters, self._effects.gravity, self._effects.compiled,
             np.ascontiguousarray(torque), np.array(marks, dtype=np.int64), starts.rows, starts.time, starts.pose, starts.twist,
-            starts.position, starts.velocity, bodies, joints,
+            starts.position, starts.velocity, starts.relaxed_slip, bodies, joints,
         )  # fmt: skip
         self.reset()
         if not fine:

@@ -35,13 +35,7 @@ from .concealed_effects import (
     first_on_patch,
 )
 from .effect_size import EffectSize, HealthyChannels
-from .healthy_deviations import (
-    draw_deviations,
-    effect_instance,
-    healthy_numbers,
-    tolerated_cost,
-    with_deviations,
-)
+from .healthy_deviations import draw_deviations, effect_instance, healthy_numbers, with_deviations
 from .outside_effects import OUTSIDE_EFFECTS
 from .random_robots import draw_robot
 from .simulated_case import Run, SimulatedRecording, World, simulate
@@ -278,7 +272,7 @@ class _Drawing:
                 self._retune(size, channels)
                 runs = [simulate(self._world.quiet(), run, instances)]
                 left = channels.evidence(self._world.nominal, runs, instances)
-                size = self._not_tolerated(dataclasses.replace(size, evidence=left), instances)
+                size = dataclasses.replace(size, evidence=left)
             found += [self._entry(instance, size, healthy) for instance in instances]
         return found
 
@@ -312,7 +306,7 @@ class _Drawing:
                 if kept is not None and instances == kept[0]:
                     break  # at its limit
                 runs = [simulate(self._world.quiet(), run, instances)]
-                size = self._not_tolerated(channels.size(runs, instances), instances)
+                size = channels.size(runs, instances)
             except PcwError:  # too much for the robot, or for the effect's own range
                 factor *= 0.3
                 continue
@@ -323,14 +317,6 @@ class _Drawing:
         if kept is None:
             raise MismatchError(f"{self._order.name}: {self._order.effects} at no size that the robot can be driven with")
         return kept
-
-    def _not_tolerated(self, size: EffectSize, instances: Sequence[EffectInstance]) -> EffectSize:
-        """Return the size with no more evidence than each effect has against a healthy robot that differs by just that.
-
-        What one run costs more than another is also that a robot which slips goes another way.
-        """
-        tolerated = min(tolerated_cost(self._base, instance) for instance in instances)
-        return dataclasses.replace(size, evidence=min(size.evidence, tolerated))
 
     def _retune(self, size: EffectSize, channels: HealthyChannels) -> None:
         """Move the numbers of the description to where they hide the effect best; the controller believes them too."""

@@ -30,6 +30,7 @@ from ..errors import MismatchError
 from ..noise_model import fit_noise_model, huber_weights
 from ..regression_problem import BoolArray, FloatArray, RegressionProblem
 from ..robot_channels import RobotProblemBuilder
+from .healthy_deviations import tolerated_cost
 from .simulated_case import SimulatedRecording
 
 EXACT_ROUNDS = 8  # of re-tuning, each exact where the one before came out
@@ -104,13 +105,13 @@ class HealthyChannels:
         rows = problem.valid & np.isfinite(change)
         relative = _rms(change, rows) / self.floor
         largest = int(np.argmax(relative))
-        cost, moved = self._cost(with_effect)
+        (cost, moved), described = self._costs(self._nominal, with_effect, recordings, effects)
         _, healthy_moved = self._healthy_cost
         active = np.any(rows & (np.abs(change) > self.floor), axis=1)
         return EffectSize(
             size=float(relative[largest]),
             channel=problem.channels[largest].name,
-            evidence=max(cost - self._explained(self._nominal, recordings, effects), 0.0),
+            evidence=_evidence(self._nominal, cost - described, effects),
             region=_regions(problem, active),
             retuned={n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)},
         )
@@ -119,18 +120,25 @@ class HealthyChannels:
         self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance] = ()
     ) -> float:
         """The evidence of effects in these runs against another description [nats], see above."""
-        cost, _ = self._cost(_build(nominal, recordings, self._cutoff))
-        return max(cost - self._explained(nominal, recordings, effects), 0.0)
+        (cost, _), described = self._costs(nominal, _build(nominal, recordings, self._cutoff), recordings, effects)
+        return _evidence(nominal, cost - described, effects)
 
-    def _explained(
-        self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance]
-    ) -> float:
-        """What no description explains: the cost of the healthy runs, or of these against one that holds the effects."""
+    def _costs(
+        self, nominal: RobotDescription, problem: RegressionProblem, recordings: Sequence[SimulatedRecording],
+        effects: Sequence[EffectInstance],
+    ) -> tuple[tuple[float, FloatArray], float]:
+        """Cost and re-tuning of runs with effects, and what no description explains of them.
+
+        That is the cost of the healthy runs, or of these against a description that holds the effects. Which samples can be
+        judged hangs on the description, too: those that only one of them judges are no evidence.
+        """
         healthy, _ = self._healthy_cost
         if not effects or not all(_in_channels(instance) for instance in effects):
-            return healthy
-        described = dataclasses.replace(nominal, physics=(*nominal.physics, *effects))
-        return max(healthy, self._cost(_build(described, recordings, self._cutoff))[0])
+            return self._cost(problem), healthy
+        holding = _build(dataclasses.replace(nominal, physics=(*nominal.physics, *effects)), recordings, self._cutoff)
+        both = problem.valid & holding.valid
+        described, _ = self._cost(dataclasses.replace(holding, valid=both))
+        return self._cost(dataclasses.replace(problem, valid=both)), max(healthy, described)
 
     def _change(self, other: RegressionProblem) -> FloatArray:
         """What the residual of another run is more than that of the quiet one (T, C)."""
@@ -204,6 +212,14 @@ class HealthyChannels:
         solution = np.linalg.solve(scaled.T @ scaled + np.eye(scaled.shape[1]), scaled.T @ wanted)
         moved = self._deviations * solution
         return values - self._columns @ moved, moved
+
+
+def _evidence(robot: RobotDescription, costs_more: float, effects: Sequence[EffectInstance]) -> float:
+    """What runs cost more, and no more than each of the effects has against a healthy robot that differs by just that.
+
+    What one run costs more than another is also that a robot which slips goes another way.
+    """
+    return max(min([costs_more, *(tolerated_cost(robot, instance) for instance in effects)]), 0.0)
 
 
 def _in_channels(instance: EffectInstance) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.kinds import DescriptionEffect
 from pcw_description.effects.registry import get
 from pcw_description.errors import DescriptionError
 from pcw_description.robot_description import AXIS_NAMES, Caster, ContactDescription, RobotDescription
@@ -31,7 +32,7 @@ MOVED: Mapping[str, Mapping[str, str]] = {
     "caster_offset_error": {"x": "caster_offset.x/{caster}", "y": "caster_offset.y/{caster}"},
     "steer_zero_offset": {"offset": "steer_zero/{caster}"},
     "torque_constant_error": {"error": "torque_constant/{caster}_{axis}"},
-    "payload_offset": {"x": "chassis.com.x", "y": "chassis.com.y"},
+    "payload_offset": {"x": "chassis.com.x", "y": "chassis.com.y", "z": "chassis.com.z"},
     "payload_mass": {"mass": "chassis.mass"},
     "ground_slope": {"angle": "ground.slope.x"},  # whichever its direction: the tolerance is that of y
     "imu_lever_arm": {"x": "imu.position.x", "y": "imu.position.y"},
@@ -109,6 +110,11 @@ def tolerated_cost(robot: RobotDescription, instance: EffectInstance) -> float:
     Infinite where an effect is more than numbers that a healthy robot may differ in.
     """
     deviations = {number.name: number.deviation for number in healthy_numbers(robot)}
+    if instance.name == "payload_mass":  # its place and its mass together move the centre of mass
+        return sum(0.5 * (moved / deviations[name]) ** 2 for name, moved in _moved_by_payload(robot, instance).items())
+    if instance.name == "tyre_relaxation" and set(instance.target) == set(robot.caster_names):
+        longer = instance.parameters["length"] - robot.contact.relaxation_length
+        return 0.5 * (longer / deviations[RELAXATION]) ** 2
     cost = 0.0
     for parameter, value in instance.parameters.items():
         if value == 0.0 or parameter in NO_NUMBERS:
@@ -118,6 +124,15 @@ def tolerated_cost(robot: RobotDescription, instance: EffectInstance) -> float:
             return math.inf
         cost += sum(0.5 * (value / deviations[name]) ** 2 for name in names)
     return cost
+
+
+def _moved_by_payload(robot: RobotDescription, payload: EffectInstance) -> dict[str, float]:
+    """How far a payload moves healthy numbers of the chassis, by name."""
+    effect = get(payload.name)
+    assert isinstance(effect, DescriptionEffect)
+    own, loaded = robot.chassis, effect.apply(robot, payload.target, payload.parameters).chassis
+    moved = {f"chassis.com.{axis}": there - here for axis, here, there in zip("xyz", own.com, loaded.com, strict=True)}
+    return moved | {f"chassis.{name}": getattr(loaded, name) - getattr(own, name) for name in ("mass", "inertia_zz")}
 
 
 def numbers_moved(effect: str, target: Sequence[str], parameter: str, axis: str | None = None) -> tuple[str, ...]:
@@ -189,6 +204,7 @@ def _shared_numbers(robot: RobotDescription) -> list[HealthyNumber]:
         ),
         HealthyNumber("chassis.com.x", _tolerance(robot, "chassis.com", 0.0), centre(0)),
         HealthyNumber("chassis.com.y", _tolerance(robot, "chassis.com", 0.0), centre(1)),
+        HealthyNumber("chassis.com.z", _tolerance(robot, "chassis.com", 0.0), centre(2)),
         HealthyNumber("contact.mu_p", _tolerance(robot, "contact.mu_p", 1.0), _friction),
         HealthyNumber("contact.stiffness", _tolerance(robot, "contact.stiffness", 1.0), _compliance),
         HealthyNumber(RELAXATION, _tolerance(robot, RELAXATION, robot.contact.relaxation_length), _relaxation),
