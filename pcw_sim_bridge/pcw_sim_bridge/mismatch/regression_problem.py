@@ -168,8 +168,8 @@ class Term:
             that the model misjudges.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
         recording: the only one in which it is at work; None: it is in all, at the same time.
-        headed: changes of the nuisances by name -> its columns where these turn, or tilt, what it is a function of; None where they
-            hardly do. None where it is a function of nothing that is re-tuned.
+        headed: changes of the nuisances by name -> its columns where these turn, or tilt, what it is a function of; None where
+            they hardly do. None where it is a function of nothing that is re-tuned.
     """
 
     effect: str
