@@ -2,17 +2,18 @@
 
 import dataclasses
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pcw_description import load_robot
+from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects
 from pcw_description.errors import DescriptionError
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.challenge import cases
+from pcw_sim_bridge.mismatch.challenge import cases, effect_size
 from pcw_sim_bridge.mismatch.challenge.cases import (
     KINDS,
     MASKINGS,
@@ -45,6 +46,7 @@ from pcw_sim_bridge.mismatch.challenge.outside_effects import OUTSIDE_EFFECTS, C
 from pcw_sim_bridge.mismatch.challenge.random_robots import draw_robot
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, SimulatedRecording, World, record, simulate
 from pcw_sim_bridge.mismatch.errors import MismatchError
+from pcw_sim_bridge.mismatch.regression_problem import RegressionProblem
 
 THESIS = load_robot("thesis")
 RUN = Run("recordings/run_1", "identification", 12.0, 5)
@@ -210,6 +212,25 @@ def test_what_is_within_tolerance_has_hardly_any_evidence(channels: HealthyChann
         found.append(channels.size([simulate(world().quiet(), RUN, [effect])]))
     assert found[0].evidence < 5.0
     assert found[1].evidence > 18.0
+
+
+def test_samples_that_one_description_alone_judges_are_no_evidence(
+    channels: HealthyChannels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A payload of a hundredth of the chassis had 547 nats, all of them of such samples."""
+    effect = effect_instance("drive_coulomb_friction", ("front_left",), {"coulomb": 0.3})
+    runs = [simulate(world().quiet(), RUN, [effect])]
+    whole, build = channels.size(runs, [effect]).evidence, effect_size._build
+
+    def judging_half(robot: RobotDescription, recordings: Sequence[SimulatedRecording], cutoff: float) -> RegressionProblem:
+        problem = build(robot, recordings, cutoff)
+        late = problem.time > 0.5 * RUN.duration
+        return dataclasses.replace(problem, valid=problem.valid & ~late[:, None]) if robot.physics else problem
+
+    monkeypatch.setattr(effect_size, "_build", judging_half)
+    half = channels.size(runs, [effect]).evidence
+    print(f"{whole:.0f} nats, of half of the samples {half:.0f}")
+    assert 0.2 * whole < half < 0.8 * whole
 
 
 def test_what_is_a_curved_number_has_no_more_evidence_than_its_tolerance_costs(channels: HealthyChannels) -> None:

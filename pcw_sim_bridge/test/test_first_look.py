@@ -140,7 +140,8 @@ def test_other_waves_are_asked_beside_what_was_found(tmp_path: Path) -> None:
     assert math.cos(2.0 * (dict(found.shape)["direction"] - 2.6)) > 0.98  # half a turn on the floor is the same
 
 
-@pytest.mark.parametrize("again", [pytest.param(True, marks=pytest.mark.nightly), False])
+@pytest.mark.nightly  # a whole analysis, like that of others here
+@pytest.mark.parametrize("again", [True, False])
 def test_a_push_is_proved_on_held_out_data_only_if_it_comes_there_too(again: bool, tmp_path: Path) -> None:
     """At the same time, as where somebody staged it; a recording without a push proves nothing, and is not made worse."""
     push = {"name": "external_push", "target": ["chassis"], "force_x": 20.0, "force_y": -8.0, "start": 6.3, "duration": 1.5}

@@ -183,7 +183,7 @@ def test_soft_tyres_have_taken_up_their_forces_where_a_window_begins(tmp_path: P
     assert right < 0.5 * error and right < 1.5 * floor
 
 
-@pytest.mark.parametrize("plant", ["reduced", "pybullet"])
+@pytest.mark.parametrize("plant", ["reduced", pytest.param("pybullet", marks=pytest.mark.nightly)])
 def test_tyres_that_roll_far_for_their_forces_have_them_where_a_window_begins(tmp_path: Path, plant: str) -> None:
     """In half a second the robot rolls less than the relaxation length: the true one was further off than the nominal one."""
     relaxation = [physics("tyre_relaxation", THESIS.caster_names[1], length=0.4)]

@@ -285,6 +285,7 @@ def _module(path: Path) -> ModuleType:
     return module
 
 
+@pytest.mark.nightly  # two whole analyses, like those of others here
 def test_the_generated_effect_brings_simulator_and_held_out_recording_together(tmp_path, monkeypatch, request):
     """Analysed, proved, written, given to another program: channels and rollout come nearer, and both plants feel it."""
     fit = record(tmp_path / "fit", cubic, 4, monkeypatch)

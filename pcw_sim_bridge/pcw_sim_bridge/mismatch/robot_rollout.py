@@ -38,7 +38,7 @@ STEP = 1e-3  # [s], at most
 # than they were measured.
 LEAD = 0.5
 SETTINGS = 5  # times in the lead that the motion is set as it was measured
-SLOWEST_SLIP = 15.0  # [Hz]; what forces do faster is more noise of torques and accelerations than slip of tyres
+FASTEST_SLIP = 15.0  # [Hz]; what forces do faster is more noise of torques and accelerations than slip of tyres
 CUTOFF_SHARE = 8.0  # sampling rate over the largest cut-off; motions and torques shall be as sharp as they can be
 NOISE_SAMPLES = 8000  # of a signal that its noise is taken from
 
@@ -291,7 +291,7 @@ def _rolling(robot: RobotDescription, numbers: ModelNumbers, motion: RobotMotion
     """
     layout = ChannelLayout(robot.caster_names, balanced=True, imu=False, pose=False)
     state = rolling_state(motion, numbers, layout, ChannelModel(robot, numbers, layout).around(motion))
-    wheels, slow = state.wheels, SignalFilter(motion.rate, SLOWEST_SLIP)
+    wheels, slow = state.wheels, SignalFilter(motion.rate, FASTEST_SLIP)
     slip = slips(numbers, motion.rate, wheels.speed, state.force, state.grip)
     slip_twist, _ = rigid_motions(numbers, wheels.steer_angle, wheels.direction, slip, wheels.offset)
     relaxed = numbers.tyres[:, LENGTH, None] * slip_ratios(numbers.tyres, state.force, state.grip)
