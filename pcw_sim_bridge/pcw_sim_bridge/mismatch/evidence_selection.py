@@ -264,14 +264,22 @@ class EffectSearch(SetGrowth):
             one, other = terms[first.term], terms[second.term]
             if one.effect != other.effect or one.target != other.target or one.axis == other.axis or len(one.target) < 2:
                 continue
-            others = tuple(i for i in selection.fit.instances if i not in (first, second))
             alike = [name for name in all_effects()[one.effect].look_alikes if all_effects()[name].target_kind == "chassis"]
+            # What is carried displaces the centre of mass itself: beside a displaced one its place would be anywhere.
+            others = tuple(
+                i for i in selection.fit.instances if i not in (first, second) and not set(self._look_alikes(i)) & set(alike)
+            )
             for rival in (k for k, term in enumerate(terms) if term.effect in alike):
                 instead, odds = self._with_rival(selection, others, rival, -selection.threshold)
                 if instead is not selection:
                     self.where_exact[rival, first.term] = min(-odds, REPLACED_ODDS)
                     return instead
         return selection
+
+    def _look_alikes(self, instance: Instance) -> tuple[str, ...]:
+        """Names of the look-alikes of an instance's effect; none of a law that is in no library."""
+        known = all_effects().get(self.problem.terms[instance.term].effect)
+        return known.look_alikes if known is not None else ()
 
     def with_one_look_alike(self, selection: Selection) -> Selection:
         """Exchange an effect of some casters, and its look-alike of a part of them, for that look-alike of all of them.
@@ -282,8 +290,7 @@ class EffectSearch(SetGrowth):
         terms = self.problem.terms
         for first, second in itertools.permutations(selection.fit.instances, 2):
             one, other = terms[first.term], terms[second.term]
-            known = all_effects().get(one.effect)
-            if known is None or other.effect not in known.look_alikes or not set(other.target) < set(one.target):
+            if other.effect not in self._look_alikes(first) or not set(other.target) < set(one.target):
                 continue
             others = tuple(i for i in selection.fit.instances if i not in (first, second))
             for rival, term in enumerate(terms):
