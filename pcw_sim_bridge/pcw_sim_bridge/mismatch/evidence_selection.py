@@ -110,7 +110,7 @@ class EffectSearch(SetGrowth):
             # Exact there, but with the columns of the description: those of effects are so, too, and are compared with them.
             self.problem = plain.exact_at(self.problem.point.changes, ())
         if self.problem.point is not None:
-            # Ripples turn with a heading, not with what is read of it; by now the zeros are known.
+            # Ripples turn with a heading, not with what is read of it; by now the zeros are known, and how the floor leans.
             changes = self.problem.point.changes
             self.description, self.problem = self.description.with_headings(changes), self.problem.with_headings(changes)
         # Of all numbers this one moves far in healthy robots, and what every torque does hangs on it.

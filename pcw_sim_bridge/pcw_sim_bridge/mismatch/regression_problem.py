@@ -453,10 +453,11 @@ class RegressionProblem:
         return moved
 
     def with_headings(self, changes: Mapping[str, float]) -> RegressionProblem:
-        """Return the problem in which what ripples with a heading does so with the heading as these changes turn it.
+        """Return the problem in which effects are those of headings and a floor as these changes turn and tilt them.
 
         A zero that is off by what may be turns a ripple of a high order by more than a right angle: what is one effect of all
-        casters would be another one of each, and none of them where the problem is exact.
+        casters would be another one of each, and none of them where the problem is exact. An IMU's error is one of what a
+        leaning floor adds, too.
         """
         headed = {k: term.headed(changes) for k, term in enumerate(self.terms) if term.headed is not None}
         turned = {k: columns for k, columns in headed.items() if columns is not None}
