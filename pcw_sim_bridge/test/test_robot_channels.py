@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from pcw_description import RobotDescription, load_robot
+from pcw_description.contact.contact_model import LENGTH, slip_under_load, tyre_step
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
@@ -22,6 +24,7 @@ from pcw_sim_bridge.mismatch.rolling_model import (
     ModelNumbers,
     Surroundings,
     channel_sides,
+    slips,
     wheel_motion,
 )
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -39,10 +42,18 @@ def wandering(time: float) -> np.ndarray:
     )
 
 
-def record(folder: Path, robot: RobotDescription, seed: int, plant: str = "reduced") -> Recording:
+def shaking(time: float) -> np.ndarray:
+    """The same with accelerations of some hertz besides, by which slow tyres are known."""
+    fast = np.array([0.1 * np.sin(14.0 * time), 0.1 * np.sin(19.0 * time), 0.3 * np.sin(23.0 * time)])
+    return wandering(time) + min(time, 1.0) * fast
+
+
+def record(
+    folder: Path, robot: RobotDescription, seed: int, plant: str = "reduced", twist: Callable[[float], np.ndarray] = wandering
+) -> Recording:
     """Drive `robot` under a controller that knows only the nominal one."""
     path = folder / f"run{seed}"
-    record_run(robot, wandering, DURATION, seed, path, plant, controlled_as=load_robot("thesis"))
+    record_run(robot, twist, DURATION, seed, path, plant, controlled_as=load_robot("thesis"))
     return Recording.open(path, load_robot("thesis"))
 
 
@@ -519,6 +530,57 @@ def test_a_tyre_relaxes_from_its_own_length_on(tmp_path: Path, own: float | None
     taken, first_order = (np.where(problem.valid, values, 0.0) for values in (problem.residual - exact[0], column * longer))
     slips = slice(3, 3 + 2 * THESIS.n)
     assert np.sum(taken[:, slips] * first_order[:, slips]) / np.sum(first_order[:, slips] ** 2) == pytest.approx(1.0, abs=0.1)
+
+
+def test_slips_are_those_that_the_tyre_itself_takes_to_its_forces() -> None:
+    """Under a load that rises and falls by a third twice a second; without what more load takes up they are 3 % apart."""
+    step, speed, load_before = 1e-4, 0.5, 200.0
+    time = np.arange(0.0, 4.0, step)
+    wanted = 0.02 * np.sin(8.0 * time) + 0.01 * np.sin(11.0 * time)
+    load = 200.0 + 60.0 * np.sin(12.0 * time + 1.0)
+    numbers = ModelNumbers.of(THESIS)
+    numbers.tyres[:, LENGTH] = 0.2
+    z, force = [0.0, 0.0], np.zeros((len(time), THESIS.n, 2))
+    for k in range(len(time)):
+        z = [slip_under_load(value, load_before, load[k]) for value in z]
+        *z, force_x, force_y = tyre_step(numbers.tyres[0], *z, wanted[k], -wanted[k], speed, load[k], step)
+        force[k], load_before = (force_x, force_y), load[k]
+    carried = np.repeat(load[:, None], THESIS.n, axis=1)
+    wheels = SimpleNamespace(speed=np.full_like(carried, speed), normal=carried)
+    found = slips(numbers, 1.0 / step, wheels, force, carried)[5000:-5000, 0]  # type: ignore[arg-type]
+    true = np.stack([wanted, -wanted], axis=1)[5000:-5000]
+    assert np.linalg.norm(found - true) < 0.01 * np.linalg.norm(true)
+
+
+def test_how_long_a_tyre_is_comes_out_of_slips_that_lag_by_a_part_of_a_step(tmp_path: Path) -> None:
+    """Forces of a simulation act half a step before its slips: with damping to re-tune, a soft tyre is not too short."""
+    sensors = THESIS.sensors
+    assert sensors.encoders is not None
+    fine = dataclasses.replace(sensors.encoders, drive_counts=2.0**20, steer_counts=2.0**20)
+    exact = dataclasses.replace(fine, velocity_noise=0.0, torque_noise=0.0)
+    quiet = dataclasses.replace(THESIS, sensors=dataclasses.replace(sensors, encoders=exact))
+    true, longer = (
+        quiet.with_tyres(["rear_left"], lambda tyre, length=length: dataclasses.replace(tyre, relaxation_length=length))
+        for length in (0.1, 0.102)
+    )
+    recording = record(tmp_path, true, 5, twist=shaking)
+    problem, other = (RobotProblemBuilder(robot, [recording]).build(with_terms=False) for robot in (true, longer))
+    valid = problem.valid & other.valid
+    weight = np.where(valid, 1.0 / np.std(problem.residual, axis=0), 0.0)
+    column = (other.residual - problem.residual)[..., None] / 0.02
+
+    def misjudged(names: set[str]) -> float:
+        """By how much of itself that length is off, all numbers with these names re-tuned."""
+        nuisances = [nuisance for nuisance in problem.nuisances if nuisance.name in names]
+        deviations = np.array([*(nuisance.deviation for nuisance in nuisances), 1e3])
+        columns = np.concatenate([*(nuisance.column[..., None] for nuisance in nuisances), column], axis=2) * weight[..., None]
+        rows = np.vstack([columns.reshape(-1, len(deviations)) * deviations, np.eye(len(deviations))])
+        target = np.r_[(problem.residual * weight).ravel(), np.zeros(len(deviations))]
+        return float(abs(np.linalg.lstsq(rows, target, rcond=None)[0][-1] * 1e3))
+
+    names = {nuisance.name for nuisance in problem.nuisances}
+    assert misjudged(names) < 0.02
+    assert misjudged(names - {"contact.damping_time"}) > 0.03
 
 
 def test_tyres_that_differ_are_not_said_to_relax_alike(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from pcw_description.contact.contact_model import LENGTH, with_friction
+from pcw_description.contact.contact_model import DAMPING_TIME, LENGTH, with_friction
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
 from .all_cores import on_all_cores
@@ -84,6 +84,8 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
     if layout.balanced:
         # A drive reports the torque of some instant within its own cycle; nobody knows which.
         found.append(VariedNumber("torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
+        # Nor does anybody know how much rubber damps: by that a soft tyre would be found too short or too long.
+        found.append(VariedNumber("contact.damping_time", "s", DAMPING_TIME, 0.5 * DAMPING_TIME, _entry("damping_time")))
         found += _unreported(differences)
     found += _suspension(differences)
     deviations = list(_geometry(robot))

@@ -292,7 +292,7 @@ def _rolling(robot: RobotDescription, numbers: ModelNumbers, motion: RobotMotion
     layout = ChannelLayout(robot.caster_names, balanced=True, imu=False, pose=False)
     state = rolling_state(motion, numbers, layout, ChannelModel(robot, numbers, layout).around(motion))
     wheels, slow = state.wheels, SignalFilter(motion.rate, FASTEST_SLIP)
-    slip = slips(numbers, motion.rate, wheels.speed, state.force, state.grip)
+    slip = slips(numbers, motion.rate, wheels, state.force, state.grip)
     slip_twist, _ = rigid_motions(numbers, wheels.steer_angle, wheels.direction, slip, wheels.offset)
     relaxed = numbers.tyres[:, LENGTH, None] * slip_ratios(numbers.tyres, state.force, state.grip)
     return wheels.twist - slow.smooth(slip_twist), slow.smooth(relaxed)

@@ -15,10 +15,10 @@ A chassis that leans on its springs, or stands on uneven ground or on a wheel th
 the vertical in its horizontal axes, the contact is where the wheel is lowest, b_x = b_x0 - r t_x in the wheel's frame, and
 weights turn the steering.
 
-and the tyre under that force slips: eps = |V_w| lambda(F) + L d lambda / dt, the relaxed slip solved for eps. The robot's
-twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a missing force of a tenth of
-the whole, growing with frequency; the channels end well below the resonance of the robot on its tyres. Where no torques
-were recorded, the forces are those that the motion asks of the wheels, shared as evenly as can be.
+and the tyre under that force slips: eps = |V_w| lambda(F) + L (d lambda / dt + lambda max(dN/dt, 0) / N), the relaxed slip
+solved for eps. The robot's twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a
+missing force of a tenth of the whole, growing with frequency; the channels end well below the resonance of the robot on its
+tyres. Where no torques were recorded, the forces are those that the motion asks of the wheels, shared as evenly as can be.
 
 Every number of the description that a healthy robot may differ in is a nuisance column, by differences of the whole
 model; so is every effect. Robots whose wheels have no offset along their heading (b_x = 0), or that have a fixed axle,
@@ -59,8 +59,8 @@ from .signal_filter import derivative
 
 # Of the numbers of the model those that say nothing of how wheels move, but what is felt, sensed and slips.
 OF_NO_MOTION = frozenset((
-    "gain", "torque_lag", "unreported", "tyres", "softness", "imu_position", "gyro_bias", "gyro_scale", "accelerometer_bias",
-    "accelerometer_scale", "imu_lean", "clock", "tracked",
+    "gain", "torque_lag", "unreported", "tyres", "damping_time", "softness", "imu_position", "gyro_bias", "gyro_scale",
+    "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock", "tracked",
 ))  # fmt: skip
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
@@ -219,6 +219,7 @@ class ModelNumbers:
         axle: fixed axles (k, 3), k of 0 or 1: their middle [m] and heading [rad].
         tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
         tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
+        damping_time: of their rubber [s]: a tyre's force is ahead of its relaxed slip by this.
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
         unreported: how much of each kind of `loops` the joints were given more than drives that hold speeds report, drives and
             steerings (2, 2) [1], [1/s].
@@ -249,6 +250,7 @@ class ModelNumbers:
     axle: FloatArray
     tracked: FloatArray
     tyres: FloatArray
+    damping_time: float
     softness: FloatArray
     torque_lag: float
     unreported: FloatArray
@@ -316,6 +318,7 @@ class ModelNumbers:
             axle=robot.fixed_axle.copy(),
             tracked=tracked_place(robot),
             tyres=np.array([tyre_parameters(tyre) for tyre in (*robot.tyres, *(robot.contact for _ in robot.fixed_axle))]),
+            damping_time=DAMPING_TIME,
             softness=np.ones((robot.n + len(robot.fixed_axle), 2)),
             torque_lag=0.0,
             unreported=np.zeros((2, 2)),
@@ -606,21 +609,30 @@ def acceleration_of(twist: FloatArray, twist_dot: FloatArray) -> FloatArray:
 def slips(
     numbers: ModelNumbers,
     rate: float,
-    speed: FloatArray,
+    wheels: WheelMotion,
     force: FloatArray,
     grip: FloatArray,
     straight: StraightTyres | None = None,
 ) -> FloatArray:
-    """Slip velocities (T, n, 2) [m/s] of tyres under forces (T, n, 2), at rolling speeds and loads (T, n)."""
+    """Slip velocities (T, n, 2) [m/s] of rolling tyres under forces (T, n, 2) and loads times friction factors (T, n) [N]."""
     if straight is not None and np.array_equal(straight.tyres[:, :LENGTH], numbers.tyres[:, :LENGTH]):
         ratio = straight.ratios(force, grip)
     else:
         ratio = slip_ratios(numbers.tyres, force, grip)
     ratio = numbers.softness * ratio
-    ratio -= DAMPING_TIME * derivative(ratio, rate)
-    result: FloatArray = speed[:, :, None] * ratio
-    result += numbers.tyres[:, LENGTH, None] * derivative(ratio, rate)
+    ratio -= numbers.damping_time * derivative(ratio, rate)
+    result: FloatArray = wheels.speed[:, :, None] * ratio
+    result += numbers.tyres[:, LENGTH, None] * (derivative(ratio, rate) + loading(wheels.normal, rate)[:, :, None] * ratio)
     return result
+
+
+def loading(normal: FloatArray, rate: float) -> FloatArray:
+    """Rates at which loads (T, n) [N] grow, of themselves [1/s]; zero where they fall.
+
+    What more load brings to the ground is not sheared yet, see `slip_under_load`: it takes up relaxed slip.
+    """
+    growth: FloatArray = np.maximum(derivative(normal, rate), 0.0) / np.maximum(normal, 1.0)
+    return growth
 
 
 def _axle_speeds(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
@@ -870,7 +882,7 @@ def channel_sides(
     """
     state = rolling_state(motion, numbers, layout, around)
     wheels = state.wheels
-    slip = slips(numbers, motion.rate, wheels.speed, state.force, state.grip, around.straight)
+    slip = slips(numbers, motion.rate, wheels, state.force, state.grip, around.straight)
     slip_twist, slip_contradiction = rigid_motions(numbers, wheels.steer_angle, wheels.direction, slip, wheels.offset)
     twist = wheels.twist - slip_twist
     twist_dot = derivative(twist, motion.rate)

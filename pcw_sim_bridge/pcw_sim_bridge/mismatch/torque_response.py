@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pcw_description.compiled import compiled
-from pcw_description.contact.contact_model import DAMPING_TIME, LENGTH
+from pcw_description.contact.contact_model import LENGTH
 from pcw_description.differential_kinematics import rigid_motion_kernel, wheel_jacobian_kernel
 from pcw_description.robot_description import DRIVE, STEER
 
@@ -25,6 +25,7 @@ from .rolling_model import (
     StraightTyres,
     WheelMotion,
     inertial_wrench,
+    loading,
 )
 from .signal_filter import derivative
 
@@ -58,7 +59,8 @@ class TorqueResponse:
         of_torque[:, :, 1, DRIVE] = offset_y / offset_x / numbers.radius
         of_torque[:, :, 1, STEER] = -1.0 / offset_x
         self._ratio_of_torque = (numbers.softness[:, :, None] * straight.of_force) @ of_torque
-        self._rate, self._speed, self._length = motion.rate, wheels.speed[:, :, None, None], numbers.tyres[:n, LENGTH]
+        self._rate, self._length, self._damping_time = motion.rate, numbers.tyres[:n, LENGTH], numbers.damping_time
+        self._speed = (wheels.speed + loading(wheels.normal, motion.rate) * self._length)[:, :, None, None]
         jacobian, self._rigid = _rigid_maps(numbers.steer_axis, wheels.offset, wheels.steer_angle)
         wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
         self._wrench_of_torque = np.einsum("tcnf,tnfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
@@ -84,7 +86,7 @@ class TorqueResponse:
         torque = np.ascontiguousarray(torque[:, casters])
         ratio_of_torque = self._ratio_of_torque[:, casters].reshape(-1, 2, 2)
         ratio = _products(ratio_of_torque, torque.reshape(-1, 2, width)).reshape(torque.shape)
-        ratio -= DAMPING_TIME * derivative(ratio, self._rate)
+        ratio -= self._damping_time * derivative(ratio, self._rate)
         slip = self._speed[:, casters] * ratio + self._length[casters, None, None] * derivative(ratio, self._rate)
         rigid = _products(np.ascontiguousarray(self._rigid[:, :, columns]), slip.reshape(count, len(columns), width))
         twist, contradiction = -rigid[:, :3], rigid[:, 3:]
