@@ -1,0 +1,113 @@
+"""Stamps of readings that were taken at even times, though a driver on a busy computer stamped them a little early or late.
+
+A joint that turns at 10 rad/s and is stamped 0.2 ms late seems to be off by 2 mrad, many times what its encoder resolves, and
+differentiated that is the largest noise there is. Whether readings came at even times or when their stamps say, they tell
+themselves: stamps that differ by e from even ones make, taken at their word, errors v e of signals that move at v. The fourth
+differences of signals x, of which a motion leaves nothing, are regressed on those of v e:
+
+    beta = sum d4(v e) d4(x) / sum d4(v e)^2        0: read at even times;  1: read when stamped
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import numpy as np
+from scipy import ndimage
+
+from pcw_description.recording import Recording
+
+from .regression_problem import FloatArray, IntArray
+
+FOLLOWED = 0.05  # part of a difference by which the even time of the next reading is moved
+# Where stamps differ from even ones by more than the first part of a step as a rule, or by more than the second now and then,
+# whose turn a reading is would be a guess.
+USUAL_DIFFERENCE, LARGEST_DIFFERENCE = 0.2, 0.45
+LEAST_SHARE = 0.999  # of the readings that are nearer than that
+SLOW = 2.0  # [s]; over which clocks that drift are followed
+MOTION = 0.05  # [s]; over which speeds are averaged
+SURE = 0.2  # largest deviation of beta that decides
+LEAST_READINGS = 200
+
+
+def evenly_stamped(recording: Recording) -> Recording:
+    """Return the recording with even stamps of all sensors of which the readings say that they came at even times.
+
+    Commands that carry the stamps of the states they answer keep them.
+    """
+    joints, imu, truth = recording.joint_states, recording.imu, recording.ground_truth
+    moved = copy.copy(recording)
+    stamp = even_stamps(joints.stamp, joints.position.reshape(len(joints.stamp), -1))
+    if stamp is not joints.stamp:
+        moved.joint_states = dataclasses.replace(joints, stamp=stamp)
+        commands = recording.joint_commands
+        if commands is not None and np.mean(np.isin(commands.stamp, joints.stamp)) > 0.5:
+            nearest = np.clip(np.searchsorted(joints.stamp, commands.stamp), 0, len(stamp) - 1)
+            later = np.interp(commands.stamp, joints.stamp, stamp - joints.stamp)
+            answered = np.where(joints.stamp[nearest] == commands.stamp, stamp[nearest], commands.stamp + later)
+            moved.joint_commands = dataclasses.replace(commands, stamp=np.maximum.accumulate(answered))
+    if imu is not None:
+        sensed = np.column_stack([imu.gyro[:, 2], imu.acceleration[:, :2]])
+        if (stamp := even_stamps(imu.stamp, sensed)) is not imu.stamp:
+            moved.imu = dataclasses.replace(imu, stamp=stamp)
+    if truth is not None:
+        pose = truth.pose.copy()
+        pose[:, 2] = np.unwrap(pose[:, 2])
+        if (stamp := even_stamps(truth.stamp, pose)) is not truth.stamp:
+            moved.ground_truth = dataclasses.replace(truth, stamp=stamp)
+    return moved
+
+
+def even_stamps(stamp: FloatArray, signals: FloatArray) -> FloatArray:
+    """Return the even times (T,) of readings (T, S), or their stamps (T,) where these say it better or nobody can tell [s]."""
+    if len(stamp) < LEAST_READINGS:
+        return stamp
+    step, turn = _turns(stamp)
+    slope, start = np.polyfit(turn, stamp, 1)
+    rest = stamp - (slope * turn + start)
+    even: FloatArray = stamp - rest + ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="nearest")
+    early = stamp - even
+    near = np.abs(early) < LARGEST_DIFFERENCE * step
+    usual = float(np.sqrt(np.mean(early[near] ** 2))) if near.any() else np.inf
+    if np.mean(near) < LEAST_SHARE or usual > USUAL_DIFFERENCE * step or np.any(np.diff(even) <= 0.0):
+        return stamp
+    beta, deviation = _reading_times(turn, early, signals, slope)
+    return even if deviation < SURE and beta < 0.5 else stamp
+
+
+def _turns(stamp: FloatArray) -> tuple[float, IntArray]:
+    """The step between readings [s], and which turn each one is (T,): more than one further where readings were lost."""
+    step = float(np.median(np.diff(stamp)))
+    turns, turn, even = [0], 0, float(stamp[0])
+    for time in stamp[1:].tolist():
+        passed = max(1, round((time - even) / step))
+        turn += passed
+        even += passed * step
+        even += FOLLOWED * (time - even)
+        turns.append(turn)
+    return step, np.array(turns)
+
+
+def _reading_times(turn: IntArray, early: FloatArray, signals: FloatArray, step: float) -> tuple[float, float]:
+    """Beta of the module and its deviation, by all signals (T, S), each counted by how much it tells."""
+    whole = turn[4:] - turn[:-4] == 4
+    width = max(3, round(MOTION / step))
+    weight, told = 0.0, 0.0
+    for values in signals.T:
+        known = np.isfinite(values)
+        if known.sum() < LEAST_READINGS:
+            continue
+        filled = np.interp(turn, turn[known], values[known])
+        speed = ndimage.uniform_filter1d(np.gradient(filled, turn * step), width)
+        used = whole & known[4:] & known[:-4]
+        moved, seen = np.diff(speed * early, 4)[used], np.diff(filled, 4)[used]
+        size = float(moved @ moved)
+        if size == 0.0:
+            continue
+        beta = float(moved @ seen) / size
+        noise = float(np.mean((seen - beta * moved) ** 2))
+        # Fourth differences of one noise hang together: by so many there are fewer of them than there are samples.
+        precision = size / max(4.0 * noise, 1e-300)
+        told, weight = told + precision * beta, weight + precision
+    return (told / weight, weight**-0.5) if weight > 0.0 else (0.0, np.inf)

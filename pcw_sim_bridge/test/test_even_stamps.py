@@ -1,0 +1,79 @@
+"""Readings at even times with stamps that tremble, and readings that came when their stamps say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pcw_description import load_robot
+from pcw_sim_bridge.mismatch.even_stamps import even_stamps
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.simulated_run import record_run
+from pcw_sim_bridge.stamping import StampingParameters
+
+STEP, JITTER = 0.002, 2e-4
+
+
+def motion(time: np.ndarray) -> np.ndarray:
+    return np.stack([3.0 * np.sin(1.3 * time), 2.0 * np.sin(0.7 * time) + time], axis=1)
+
+
+def readings(
+    seed: int, jitter: float = JITTER, drift: float = 0.0, when_stamped: bool = False, noise: float = 5e-5
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Even times (T,), stamps (T,) and signals (T, 2) of 20 s of which one in fifty readings is lost."""
+    rng = np.random.default_rng(seed)
+    even = np.flatnonzero(rng.random(10_000) > 0.02) * STEP
+    stamp = np.maximum.accumulate(even + drift * np.sin(0.2 * even) + jitter * rng.standard_normal(len(even)))
+    signals = motion(stamp if when_stamped else even) + noise * rng.standard_normal((len(even), 2))
+    return even, stamp, signals
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.005])
+def test_trembling_stamps_of_even_readings_are_made_even(drift: float) -> None:
+    """Also those of a clock that wanders by more than a step."""
+    even, stamp, signals = readings(1, drift=drift)
+    found = even_stamps(stamp, signals)
+    apart = found - even - drift * np.sin(0.2 * even)
+    assert np.std(stamp - even - drift * np.sin(0.2 * even)) == pytest.approx(JITTER, rel=0.1)
+    assert np.std(apart[500:-500]) < 0.1 * JITTER
+    assert np.all(np.diff(found) > 0.0)
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_a_signal_that_was_not_recorded_leaves_the_others_theirs(known: int) -> None:
+    _, stamp, signals = readings(2)
+    signals[:, 1 - known] = np.nan
+    assert even_stamps(stamp, signals) is not stamp
+
+
+def test_readings_that_came_when_stamped_keep_their_stamps() -> None:
+    _, stamp, signals = readings(3, when_stamped=True)
+    assert even_stamps(stamp, signals) is stamp
+
+
+def test_nobody_can_tell_of_what_stands_still_or_comes_at_any_time() -> None:
+    _, stamp, signals = readings(4)
+    assert even_stamps(stamp, 0.0 * signals) is stamp
+    assert even_stamps(stamp, np.full_like(signals, np.nan)) is stamp
+    few = stamp[:100]
+    assert even_stamps(few, signals[:100]) is few
+    _, wild, signals = readings(5, jitter=0.5 * STEP)
+    assert even_stamps(wild, signals) is wild
+    bursts = np.repeat(stamp[::5], 5)[: len(stamp)] + 1e-6 * (np.arange(len(stamp)) % 5)
+    assert even_stamps(bursts, signals[: len(bursts)]) is bursts
+
+
+def test_a_recording_is_opened_so_and_commands_keep_the_stamps_of_their_states(tmp_path: Path) -> None:
+    robot = load_robot("thesis")
+
+    def twist(time: float) -> np.ndarray:
+        return min(time, 1.0) * np.array([0.4 * np.cos(time), 0.3 * np.sin(1.3 * time), 0.5 * np.sin(0.9 * time)])
+
+    record_run(robot, twist, 8.0, 1, tmp_path / "run", "reduced", stamping=StampingParameters(stamp_jitter=JITTER, loss=1e-3))
+    recording = RobotSubject(robot).open(tmp_path / "run", "recording", {}).recording
+    joints, commands = recording.joint_states, recording.joint_commands
+    steps = np.diff(joints.stamp) / STEP
+    assert np.abs(steps - np.round(steps)).max() < 0.01
+    assert np.mean(np.isin(commands.stamp, joints.stamp)) > 0.99
+    assert np.all(np.diff(commands.stamp) >= 0.0)
