@@ -23,8 +23,9 @@ from .regression_problem import FloatArray, IntArray
 FOLLOWED = 0.05  # part of a difference by which the even time of the next reading is moved
 # Where stamps differ from even ones by more than the first part of a step as a rule, or by more than the second now and then,
 # whose turn a reading is would be a guess.
-USUAL_DIFFERENCE, LARGEST_DIFFERENCE = 0.2, 0.45
+USUAL_DIFFERENCE, LARGEST_DIFFERENCE = 0.35, 1.5
 LEAST_SHARE = 0.999  # of the readings that are nearer than that
+NEXT = 5  # readings of which all but one have to come later where one was lost; one alone was late itself
 SLOW = 2.0  # [s]; over which clocks that drift are followed
 MOTION = 0.05  # [s]; over which speeds are averaged
 SURE = 0.2  # largest deviation of beta that decides
@@ -63,8 +64,11 @@ def even_stamps(stamp: FloatArray, signals: FloatArray) -> FloatArray:
     """Return the even times (T,) of readings (T, S), or their stamps (T,) where these say it better or nobody can tell [s]."""
     if len(stamp) < LEAST_READINGS:
         return stamp
-    step, turn = _turns(stamp)
-    slope, start = np.polyfit(turn, stamp, 1)
+    step = float(np.median(np.diff(stamp)))
+    for _ in range(2):  # a median of trembling steps is no more than nearly the step
+        turn = _turns(stamp, step)
+        slope, start = np.polyfit(turn, stamp, 1)
+        step = float(slope)
     rest = stamp - (slope * turn + start)
     even: FloatArray = stamp - rest + ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="nearest")
     early = stamp - even
@@ -72,21 +76,23 @@ def even_stamps(stamp: FloatArray, signals: FloatArray) -> FloatArray:
     usual = float(np.sqrt(np.mean(early[near] ** 2))) if near.any() else np.inf
     if np.mean(near) < LEAST_SHARE or usual > USUAL_DIFFERENCE * step or np.any(np.diff(even) <= 0.0):
         return stamp
-    beta, deviation = _reading_times(turn, early, signals, slope)
+    beta, deviation = _reading_times(turn, early, signals, step)
     return even if deviation < SURE and beta < 0.5 else stamp
 
 
-def _turns(stamp: FloatArray) -> tuple[float, IntArray]:
-    """The step between readings [s], and which turn each one is (T,): more than one further where readings were lost."""
-    step = float(np.median(np.diff(stamp)))
-    turns, turn, even = [0], 0, float(stamp[0])
-    for time in stamp[1:].tolist():
-        passed = max(1, round((time - even) / step))
-        turn += passed
+def _turns(stamp: FloatArray, step: float) -> IntArray:
+    """Which turn each reading is (T,): more than one step [s] further where readings were lost."""
+    times = stamp.tolist()
+    turns, even = [0], times[0]
+    for k in range(1, len(times)):
+        passed = 1
+        if times[k] - even > 1.5 * step:
+            late = [(time - even) / step - (j + 1) for j, time in enumerate(times[k : k + NEXT])]
+            passed += max(0, min(round(late[0]), round(sorted(late)[min(1, len(late) - 1)])))
+        turns.append(turns[-1] + passed)
         even += passed * step
-        even += FOLLOWED * (time - even)
-        turns.append(turn)
-    return step, np.array(turns)
+        even += FOLLOWED * (times[k] - even)
+    return np.array(turns)
 
 
 def _reading_times(turn: IntArray, early: FloatArray, signals: FloatArray, step: float) -> tuple[float, float]:
