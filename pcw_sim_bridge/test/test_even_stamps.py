@@ -40,6 +40,14 @@ def test_trembling_stamps_of_even_readings_are_made_even(jitter: float, drift: f
     assert np.all(np.diff(found) > 0.0)
 
 
+def test_who_was_silent_may_go_on_at_times_of_another_phase() -> None:
+    even, stamp, signals = readings(6)
+    later = np.where(np.arange(len(stamp)) < 4000, 0.0, 0.7 + 0.5 * STEP)
+    apart = even_stamps(stamp + later, signals) - even - later
+    assert np.abs(apart).max() < JITTER
+    assert np.std(apart) < 0.15 * JITTER
+
+
 @pytest.mark.parametrize("known", [0, 1])
 def test_a_signal_that_was_not_recorded_leaves_the_others_theirs(known: int) -> None:
     _, stamp, signals = readings(2)
@@ -60,8 +68,8 @@ def test_nobody_can_tell_of_what_stands_still_or_comes_at_any_time() -> None:
     assert even_stamps(few, signals[:100]) is few
     _, wild, signals = readings(5, jitter=0.5 * STEP)
     assert even_stamps(wild, signals) is wild
-    bursts = np.repeat(stamp[::5], 5)[: len(stamp)] + 1e-6 * (np.arange(len(stamp)) % 5)
-    assert even_stamps(bursts, signals[: len(bursts)]) is bursts
+    bursts = np.repeat(wild[::5], 5)[: len(wild)] + 1e-6 * (np.arange(len(wild)) % 5)
+    assert even_stamps(bursts, signals) is bursts
 
 
 def test_a_recording_is_opened_so_and_commands_keep_the_stamps_of_their_states(tmp_path: Path) -> None:

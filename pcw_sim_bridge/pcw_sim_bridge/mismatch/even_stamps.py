@@ -26,6 +26,7 @@ FOLLOWED = 0.05  # part of a difference by which the even time of the next readi
 USUAL_DIFFERENCE, LARGEST_DIFFERENCE = 0.35, 1.5
 LEAST_SHARE = 0.999  # of the readings that are nearer than that
 NEXT = 5  # readings of which all but one have to come later where one was lost; one alone was late itself
+PAUSE = 0.1  # [s]; whoever was silent for longer may have begun anew, at times of another phase
 SLOW = 2.0  # [s]; over which clocks that drift are followed
 MOTION = 0.05  # [s]; over which speeds are averaged
 SURE = 0.2  # largest deviation of beta that decides
@@ -62,22 +63,31 @@ def evenly_stamped(recording: Recording) -> Recording:
 
 def even_stamps(stamp: FloatArray, signals: FloatArray) -> FloatArray:
     """Return the even times (T,) of readings (T, S), or their stamps (T,) where these say it better or nobody can tell [s]."""
-    if len(stamp) < LEAST_READINGS:
+    pieces = np.split(np.arange(len(stamp)), np.flatnonzero(np.diff(stamp) > PAUSE) + 1)
+    even = [_even(stamp[piece], signals[piece]) for piece in pieces]
+    if all(times is None for times in even):
         return stamp
+    return np.concatenate([stamp[piece] if times is None else times for piece, times in zip(pieces, even, strict=True)])
+
+
+def _even(stamp: FloatArray, signals: FloatArray) -> FloatArray | None:
+    """The even times of readings without a pause; None where they keep their stamps."""
+    if len(stamp) < LEAST_READINGS:
+        return None
     step = float(np.median(np.diff(stamp)))
     for _ in range(2):  # a median of trembling steps is no more than nearly the step
         turn = _turns(stamp, step)
         slope, start = np.polyfit(turn, stamp, 1)
         step = float(slope)
     rest = stamp - (slope * turn + start)
-    even: FloatArray = stamp - rest + ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="nearest")
+    even: FloatArray = stamp - rest + ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="reflect")
     early = stamp - even
     near = np.abs(early) < LARGEST_DIFFERENCE * step
     usual = float(np.sqrt(np.mean(early[near] ** 2))) if near.any() else np.inf
     if np.mean(near) < LEAST_SHARE or usual > USUAL_DIFFERENCE * step or np.any(np.diff(even) <= 0.0):
-        return stamp
+        return None
     beta, deviation = _reading_times(turn, early, signals, step)
-    return even if deviation < SURE and beta < 0.5 else stamp
+    return even if deviation < SURE and beta < 0.5 else None
 
 
 def _turns(stamp: FloatArray, step: float) -> IntArray:
