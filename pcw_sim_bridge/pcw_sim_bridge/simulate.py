@@ -25,11 +25,8 @@ from pcw_description.stop_requests import stop_requests
 from .plants.plant import PLANT_NAMES
 from .run_controllers import CONTROLLER_NAMES
 from .simulated_run import record_run
-from .stamping import StampingParameters
+from .stamping import HEALTHY, StampingParameters
 
-# What a healthy on-board computer and a healthy network do.
-STAMP_JITTER = 2e-4  # [s]
-LOSS = 1e-3
 PROGRESS_PERIOD = 0.5  # real time between two looks at the progress [s]
 
 
@@ -68,10 +65,10 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument(
         "--stamp-jitter", type=float, metavar="SECONDS",
-        help=f"standard deviation of the stamps (default: {STAMP_JITTER:g})",
+        help=f"standard deviation of the stamps (default: {HEALTHY.stamp_jitter:g})",
     )
     options.add_argument(
-        "--loss", type=float, metavar="FRACTION", help=f"of the messages, lost in short bursts (default: {LOSS:g})"
+        "--loss", type=float, metavar="FRACTION", help=f"of the messages, lost in short bursts (default: {HEALTHY.loss:g})"
     )
     options.add_argument("--ideal", action="store_true", help="exact stamps and no losses; the sensors keep their noise")
     options.add_argument("--list-effects", action="store_true", help="print what --physics knows")
@@ -140,8 +137,8 @@ def run(options: argparse.Namespace, stops: Sequence[float]) -> None:
         stamping = StampingParameters()
     else:
         stamping = StampingParameters(
-            STAMP_JITTER if options.stamp_jitter is None else options.stamp_jitter,
-            LOSS if options.loss is None else options.loss,
+            HEALTHY.stamp_jitter if options.stamp_jitter is None else options.stamp_jitter,
+            HEALTHY.loss if options.loss is None else options.loss,
         )
     begun = time.monotonic()
     progress = _Progress(excitation.duration, stops)

@@ -54,6 +54,10 @@ class StampingParameters:
                 raise PlantError(f"{name} = {value!r}{unit} is not allowed; allowed: 0 to {largest:g}{unit}")
 
 
+HEALTHY = StampingParameters(stamp_jitter=2e-4, loss=1e-3)
+"""What a healthy on-board computer and a healthy network do."""
+
+
 @dataclasses.dataclass(frozen=True)
 class StampingState:
     """What a topic remembers.

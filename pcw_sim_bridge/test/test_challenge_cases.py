@@ -47,6 +47,7 @@ from pcw_sim_bridge.mismatch.challenge.random_robots import draw_robot
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, SimulatedRecording, World, record, simulate
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.regression_problem import RegressionProblem
+from pcw_sim_bridge.stamping import StampingParameters
 
 THESIS = load_robot("thesis")
 RUN = Run("recordings/run_1", "identification", 12.0, 5)
@@ -120,7 +121,7 @@ def test_in_memory_is_what_the_recording_holds(controller: str, tmp_path: Path) 
     effects = [effect_instance("clock_offset", ("clock",), {"offset": 0.02})]
     own, run = world(controller=controller), dataclasses.replace(RUN, duration=10.0)
     kept = simulate(own, run, effects)
-    record(own, run, effects, tmp_path / "bag")
+    record(own, run, effects, tmp_path / "bag", StampingParameters())
     read = Recording.open(tmp_path / "bag", THESIS)
     for series in ("joint_states", "joint_commands", "imu", "ground_truth", "cmd_vel"):
         one, other = getattr(kept, series), getattr(read, series)

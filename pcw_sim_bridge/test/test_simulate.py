@@ -22,7 +22,7 @@ from pcw_description.robot_file import robot_to_mapping
 from pcw_sim_bridge import simulate
 from pcw_sim_bridge.plants.plant import PlantError
 from pcw_sim_bridge.simulated_run import record_run
-from pcw_sim_bridge.stamping import StampingParameters
+from pcw_sim_bridge.stamping import HEALTHY, StampingParameters
 
 THESIS = load_robot("thesis")
 
@@ -81,7 +81,7 @@ def test_by_default_stamps_jitter_and_messages_are_lost(tmp_path):
     near = np.round(real.joint_states.stamp / 0.002).astype(int)
     error = real.joint_states.stamp - 0.002 * near  # from the first joint state, which jitters as well
     np.testing.assert_array_equal(real.joint_states.effort, ideal.joint_states.effort[near])
-    assert error.std() == pytest.approx(simulate.STAMP_JITTER, rel=0.1)
+    assert error.std() == pytest.approx(HEALTHY.stamp_jitter, rel=0.1)
     assert np.all(np.diff(real.joint_states.stamp) > 0.0)
     # A command bears the stamp of the reading that it answers.
     assert np.isin(real.joint_commands.stamp, real.joint_states.stamp).mean() > 0.97

@@ -22,7 +22,7 @@ from ...run_controllers import make_controller
 from ...sensors import ImuReading, JointReading
 from ...simulated_robot import JointCommand, Sample, SimulatedRobot, TrackedPose
 from ...simulated_run import START_NS, drive, record_run
-from ...stamping import StampingParameters, TopicStamps
+from ...stamping import HEALTHY, StampingParameters, TopicStamps
 from .outside_effects import OUTSIDE_EFFECTS, CrossJointLaw, LawPlant
 
 FINE_COUNTS = 1e8  # [counts/rev], far below every noise
@@ -127,8 +127,10 @@ def simulate(world: World, run: Run, effects: Sequence[EffectInstance]) -> Simul
     return collected.recording(world.nominal)
 
 
-def record(world: World, run: Run, effects: Sequence[EffectInstance], path: Path) -> None:
-    """Write the recording of a run: what `simulate` gives, as messages.
+def record(
+    world: World, run: Run, effects: Sequence[EffectInstance], path: Path, stamping: StampingParameters = HEALTHY
+) -> None:
+    """Write the recording of a run: what `simulate` gives, as messages, with the stamps and losses of a real robot.
 
     Raises:
         PcwError: as `record_run`.
@@ -138,7 +140,7 @@ def record(world: World, run: Run, effects: Sequence[EffectInstance], path: Path
         excitation = make_excitation(run.excitation, world.nominal, run.duration, run.seed)
         record_run(
             robot, excitation.twist, run.duration, run.seed, path, controlled_as=world.nominal,
-            controller_name=world.controller, plant=world.make(robot, effects),
+            controller_name=world.controller, plant=world.make(robot, effects), stamping=stamping,
         )
 
 
