@@ -50,7 +50,7 @@ def simulated(folder: Path, *arguments: str, excite="chirps", duration="10", see
 def test_the_same_arguments_give_the_same_bytes(tmp_path, arguments):
     for folder in ("first", "second", "other"):
         seed = "8" if folder == "other" else "7"
-        simulated(tmp_path / folder, *arguments, excite="random_goals", seed=seed, duration="5")
+        simulated(tmp_path / folder, *arguments, excite="random_goals", seed=seed)
     first, second, other = (digest(tmp_path / folder / "bag") for folder in ("first", "second", "other"))
     assert first == second and first != other
 
@@ -102,9 +102,9 @@ def test_physics_is_at_work_and_the_controller_does_not_know(tmp_path):
     friction = "{name: drive_coulomb_friction, target: [front_left], coulomb: 1.0}"
     file = tmp_path / "effects.yaml"
     file.write_text(yaml.safe_dump({"physics": [yaml.safe_load(friction)]}), encoding="utf-8")
-    healthy = simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="12")
+    healthy = simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="20")
     inline, from_file, listed = (
-        simulated(tmp_path / name, "--ideal", "--physics", given, excite="circle", duration="12")
+        simulated(tmp_path / name, "--ideal", "--physics", given, excite="circle", duration="20")
         for name, given in (("inline", friction), ("file", str(file)), ("list", f"[{friction}]"))
     )
     assert digest(tmp_path / "inline/bag") == digest(tmp_path / "file/bag") == digest(tmp_path / "list/bag")
