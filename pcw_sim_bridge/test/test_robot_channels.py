@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pcw_control.excitation import make_excitation
 from pcw_description import RobotDescription, load_robot
 from pcw_description.contact.contact_model import LENGTH, slip_under_load, tyre_step
 from pcw_description.effect_instance import EffectInstance
@@ -29,6 +30,7 @@ from pcw_sim_bridge.mismatch.rolling_model import (
 )
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.simulated_run import record_run
+from pcw_sim_bridge.stamping import HEALTHY
 
 DURATION = 16.0
 THESIS = load_robot("thesis")
@@ -581,6 +583,21 @@ def test_how_long_a_tyre_is_comes_out_of_slips_that_lag_by_a_part_of_a_step(tmp_
     names = {nuisance.name for nuisance in problem.nuisances}
     assert misjudged(names) < 0.02
     assert misjudged(names - {"contact.damping_time"}) > 0.03
+
+
+@pytest.mark.nightly
+def test_an_effect_counts_by_the_slopes_of_where_it_is_not(tmp_path: Path) -> None:
+    """By those where a tyre takes twenty times as long to relax, softer tyres do the same, and it was dropped, twice."""
+    soft = THESIS.with_tyres(["rear_left"], lambda tyre: dataclasses.replace(tyre, relaxation_length=0.4))
+    excitation = make_excitation("identification", THESIS, 24.0, 5)
+    record_run(
+        soft, excitation.twist, excitation.duration, 5, tmp_path / "run", "reduced", controlled_as=THESIS, stamping=HEALTHY
+    )
+    problem = RobotProblemBuilder(THESIS, [Recording.open(tmp_path / "run", THESIS)]).build()
+    search = EffectSearch(problem, np.random.default_rng(0))
+    found = search.run()
+    assert [search.label(instance) for instance in found.fit.instances] == ["tyre_relaxation/rear_left"]
+    assert not [step for step in found.ladder if step.description == "drop tyre_relaxation/rear_left"]
 
 
 def test_tyres_that_differ_are_not_said_to_relax_alike(tmp_path: Path) -> None:
