@@ -330,7 +330,7 @@ def test_slips_lag_as_torques_do(tmp_path: Path) -> None:
         assert np.linalg.norm(change - told) < 0.1 * np.linalg.norm(change), before.channels[channel].name
 
 
-@pytest.mark.parametrize("plant", ["reduced", "pybullet"])
+@pytest.mark.parametrize("plant", ["reduced", pytest.param("pybullet", marks=pytest.mark.nightly)])
 def test_an_effect_is_its_own_column(tmp_path: Path, plant: str) -> None:
     """Coulomb friction on one drive: its column gives the torque within 5 %, those of the other drives explain less."""
     nominal = load_robot("thesis")
@@ -366,6 +366,7 @@ def test_an_effect_that_the_description_holds_is_not_left_over(tmp_path: Path) -
     assert np.all(rms[1][:2] < 0.3 * rms[0][:2])
 
 
+@pytest.mark.nightly
 def test_effects_of_every_kind_that_the_description_holds_are_not_left_over(tmp_path: Path) -> None:
     """Slope, drag, a wrong zero, and an IMU that is wrong in every way, all in the file: what is left is a healthy robot's."""
     nominal = load_robot("thesis")
