@@ -77,9 +77,8 @@ def _even(stamp: FloatArray, signals: FloatArray) -> FloatArray | None:
     step = float(np.median(np.diff(stamp)))
     for _ in range(2):  # a median of trembling steps is no more than nearly the step
         turn = _turns(stamp, step)
-        slope, start = np.polyfit(turn, stamp, 1)
-        step = float(slope)
-    rest = stamp - (slope * turn + start)
+        step, start = map(float, np.polyfit(turn, stamp, 1))
+    rest = stamp - (step * turn + start)
     even: FloatArray = stamp - rest + ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="reflect")
     early = stamp - even
     near = np.abs(early) < LARGEST_DIFFERENCE * step

@@ -60,7 +60,9 @@ class TorqueResponse:
         of_torque[:, :, 1, STEER] = -1.0 / offset_x
         self._ratio_of_torque = (numbers.softness[:, :, None] * straight.of_force) @ of_torque
         self._rate, self._length, self._damping_time = motion.rate, numbers.tyres[:n, LENGTH], numbers.damping_time
-        self._speed = (wheels.speed + loading(wheels.normal, motion.rate) * self._length)[:, :, None, None]
+        # A growing load takes up relaxed slip as rolling does.
+        taken_up = wheels.speed[:, :n] + loading(wheels.normal[:, :n], motion.rate) * self._length
+        self._speed = taken_up[:, :, None, None]
         jacobian, self._rigid = _rigid_maps(numbers.steer_axis, wheels.offset, wheels.steer_angle)
         wrench_of_force = jacobian.transpose(0, 2, 1).reshape(count, 3, n, 2)
         self._wrench_of_torque = np.einsum("tcnf,tnfj->tcnj", wrench_of_force, of_torque).reshape(count, 3, 2 * n)
