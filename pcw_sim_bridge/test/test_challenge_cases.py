@@ -18,6 +18,7 @@ from pcw_sim_bridge.mismatch.challenge.cases import (
     KINDS,
     MASKINGS,
     effects_of,
+    find_factor,
     order_cases,
     prepare_case,
     runs_of,
@@ -202,6 +203,35 @@ def test_what_the_description_with_the_effect_does_not_explain_is_no_evidence(ch
     assert told == pytest.approx(plain, rel=0.1)
     assert wrong < 0.05 * plain
     assert channels.evidence(THESIS, runs, [effect]) == pytest.approx(told, rel=1e-6)
+
+
+@pytest.mark.parametrize(("faint_below", "too_much_above"), [(0.0, 0.02), (1.5, 2.5), (3.0, 1e9), (100.0, 400.0)])
+def test_a_strength_is_found_between_too_faint_and_too_much(faint_below: float, too_much_above: float) -> None:
+    def strength(factor: float) -> float:
+        if factor > too_much_above:
+            raise MismatchError("the robot turns over")
+        return 5.0 if factor > faint_below else 1e-6
+
+    factor = find_factor(strength, 5.0)
+    assert factor is not None and faint_below < factor <= too_much_above
+
+
+def test_the_strength_nearest_to_a_sensible_one_is_kept() -> None:
+    def strength(factor: float) -> float:
+        if factor > 1.0:
+            raise MismatchError("the robot turns over")
+        return 0.5 * factor  # never above the floor
+
+    assert find_factor(strength, 5.0) == 1.0
+    with pytest.raises(MismatchError, match="turns over"):
+        strength(2.0)
+
+
+def test_an_effect_that_is_too_much_at_any_size_is_not_found() -> None:
+    def strength(factor: float) -> float:
+        raise MismatchError("the robot turns over")
+
+    assert find_factor(strength, 5.0) is None
 
 
 def test_what_is_within_tolerance_has_hardly_any_evidence(channels: HealthyChannels) -> None:

@@ -62,9 +62,10 @@ SHARE_OF_TWO_RECORDINGS = 0.25
 # What somebody tunes to make the effect go away stays so near to the description, in standard deviations.
 RETUNED_WITHIN = 2.0
 NOISE_RANGE = (0.5, 2.5)
-PROBES = 4
-# Draws of a case: one whose effects stay below the floor is drawn anew, but for the last. Where a motion takes casters
-# straight back, next to nothing decides which way each turns: such draws fail, and some other motion is found yet.
+PROBES = 6
+# Draws of a case: one whose effects stay below the floor is drawn anew; of so many draws, the one that shows most is kept.
+# Where a motion takes casters straight back, next to nothing decides which way each turns: such draws fail, and some other
+# motion is found yet.
 ATTEMPTS, MOST_ATTEMPTS = 6, 40
 
 Answer = Mapping[str, Any]
@@ -184,12 +185,17 @@ def prepare_case(order: CaseOrder) -> Answer:
         except PcwError as error:
             failures.append(str(error))
             continue
-        if all(e["size"] >= LEAST_SIZE and e["evidence"] >= LEAST_EVIDENCE for e in answer["effects"]):
+        if _weakest(answer) >= 1.0:
             return answer
-        faint = answer
+        faint = answer if faint is None else max(faint, answer, key=_weakest)
     if faint is None:
         raise MismatchError(f"{order.name}: no draw could be simulated; the last failed with: {failures[-1]}")
     return faint
+
+
+def _weakest(answer: Answer) -> float:
+    """The least strength of the effects of a case; infinite where there is none."""
+    return min((_strength(e["size"], e["evidence"]) for e in answer["effects"]), default=math.inf)
 
 
 class _Drawing:
@@ -298,25 +304,20 @@ class _Drawing:
         self, group: _Group, run: Run, channels: HealthyChannels
     ) -> tuple[list[EffectInstance], EffectSize]:
         """Return the effects of a group at a strength that is seen, or as near as its limits and the robot allow."""
-        factor = 1.0
-        kept: tuple[list[EffectInstance], EffectSize] | None = None
-        for _ in range(PROBES):
-            try:
-                instances = group(factor)
-                if kept is not None and instances == kept[0]:
-                    break  # at its limit
-                runs = [simulate(self._world.quiet(), run, instances)]
-                size = channels.size(runs, instances)
-            except PcwError:  # too much for the robot, or for the effect's own range
-                factor *= 0.3
-                continue
-            kept = instances, size
-            if 1.0 <= _strength(size) <= LARGEST_STRENGTH:
-                break
-            factor *= min(max(self._strength / _strength(size), 0.03), 30.0)
-        if kept is None:
+        measured: dict[float, tuple[list[EffectInstance], EffectSize]] = {}
+
+        def strength(factor: float) -> float:
+            instances = group(factor)
+            size = next((known for at, known in measured.values() if at == instances), None)  # at its limit
+            if size is None:
+                size = channels.size([simulate(self._world.quiet(), run, instances)], instances)
+            measured[factor] = instances, size
+            return _strength(size.size, size.evidence)
+
+        factor = find_factor(strength, self._strength)
+        if factor is None:
             raise MismatchError(f"{self._order.name}: {self._order.effects} at no size that the robot can be driven with")
-        return kept
+        return measured[factor]
 
     def _retune(self, size: EffectSize, channels: HealthyChannels) -> None:
         """Move the numbers of the description to where they hide the effect best; the controller believes them too."""
@@ -358,9 +359,36 @@ def _alone(draft: Draft) -> _Group:
     return lambda factor: [draft.scaled(factor).instance()]
 
 
-def _strength(size: EffectSize) -> float:
+def _strength(size: float, evidence: float) -> float:
     """How many times larger than at the detection floor an effect is."""
-    return max(min(size.size / LEAST_SIZE, math.sqrt(size.evidence / LEAST_EVIDENCE)), 1e-6)
+    return max(min(size / LEAST_SIZE, math.sqrt(evidence / LEAST_EVIDENCE)), 1e-6)
+
+
+def find_factor(strength: Callable[[float], float], wanted: float) -> float | None:
+    """Find the factor at which an effect is above the floor and no stronger than is sensible, or comes nearest to that.
+
+    Args:
+        strength: of the effect at a factor, in multiples of the floor; a PcwError where that is too much for the robot.
+        wanted: strength to aim at where the first, at a factor of 1, is not sensible.
+
+    Returns:
+        One of the factors that were tried; None if all of them were too much.
+    """
+    found: dict[float, float] = {}  # by how far the strength is not sensible, as a logarithm
+    factor, low, high = 1.0, 0.0, math.inf  # what is too faint at `low` is too much at `high`
+    for _ in range(PROBES):
+        try:
+            here = strength(factor)
+        except PcwError:
+            high, aim = factor, 0.3 * factor
+        else:
+            found[factor] = max(-math.log(here), math.log(here / LARGEST_STRENGTH), 0.0)
+            if found[factor] == 0.0:
+                break
+            low, high = (factor, high) if here < 1.0 else (low, factor)
+            aim = factor * min(max(wanted / here, 0.03), 30.0)
+        factor = aim if low < aim < high else math.sqrt(low * high)
+    return min(found, key=lambda tried: found[tried], default=None)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
