@@ -213,8 +213,13 @@ def axes_in_degrees(robot: RobotDescription, position: FloatArray, velocity: Flo
 
     Position and velocity that are wrong by the same factor agree with each other. The wheels do not: read in the
     right unit, the n casters nearly agree on one motion of the base (the residual of (3.26) is small), read in the
-    wrong one they contradict each other. Arguments (T, n, 2); () unless the verdict is clear.
+    wrong one they contradict each other. So do wheels that slide a little while they hardly steer: only what is faster,
+    read as rad, than the robot can be is taken for degrees. Arguments (T, n, 2); () unless the verdict is clear.
     """
+    rated = {DRIVE: [c.limits.drive_speed for c in robot.casters], STEER: [c.limits.steer_speed for c in robot.casters]}
+    too_fast = {axis for axis in rated if _beyond(velocity[:, :, axis], np.array(rated[axis]))}
+    if not too_fast:
+        return ()
     casters = np.flatnonzero(np.isfinite(position[:, :, STEER]).any(axis=0) & np.isfinite(velocity).any(axis=(0, 2)))
     if len(casters) < 2:
         return ()
@@ -229,11 +234,20 @@ def axes_in_degrees(robot: RobotDescription, position: FloatArray, velocity: Flo
 
     residual = {}
     for axes in ((), (DRIVE,), (STEER,), (DRIVE, STEER)):
+        if not too_fast.issuperset(axes):
+            continue
         scale = np.array([DEGREE if axis in axes else 1.0 for axis in (DRIVE, STEER)])
         residual[axes] = _rolling_residual(robot, casters, angle[rows] * scale[STEER], rate[rows] * scale)
     best = min(residual, key=lambda axes: residual[axes])
     clear = residual[()] > 0.02 and residual[best] < 0.05 and residual[()] > 5.0 * residual[best]
     return best if clear else ()
+
+
+def _beyond(speed: FloatArray, limit: FloatArray) -> bool:
+    """Whether the fastest (99 % quantile) of n joints (T, n) passes its limit (n,)."""
+    relative = np.abs(speed) / limit
+    known = relative[np.isfinite(relative)]
+    return bool(len(known)) and float(np.quantile(known, 0.99)) > 1.0
 
 
 def _rolling_residual(

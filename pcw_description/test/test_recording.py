@@ -1012,6 +1012,19 @@ def test_degrees_throughout_are_found_by_rolling(
     np.testing.assert_allclose(recording.joint_states.position, healthy.position, rtol=1e-12, atol=1e-12)
 
 
+def test_wheels_that_slide_a_little_while_they_go_straight_are_not_in_degrees(robot: RobotDescription, tmp_path: Path) -> None:
+    """They contradict each other by more than what they steer, and slower drives would not."""
+    healthy = drive(robot)
+    time = np.arange(len(healthy.stamp_ns)) / RATE
+    swing = 0.05 * np.sin(2.0 * time[:, None] + np.arange(robot.n))
+    speed = 0.5 * robot.casters[0].limits.drive_speed
+    healthy.position[:, :, STEER], healthy.velocity[:, :, STEER] = swing, np.gradient(swing, time, axis=0)
+    healthy.position[:, :, DRIVE], healthy.velocity[:, :, DRIVE] = speed * time[:, None], speed
+    recording = Recording.open(healthy.write(tmp_path / "bag"), robot)
+    assert not [str(warning) for warning in recording.warnings if warning.code == "wrong_unit"]
+    np.testing.assert_allclose(recording.joint_states.velocity[:, :, DRIVE], speed)
+
+
 def test_encoder_counts_are_named_and_left_out(robot: RobotDescription, tmp_path: Path) -> None:
     healthy = drive(robot)
     spoilt = healthy.copy()

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_sim_bridge.mismatch.even_stamps import even_stamps
+from pcw_sim_bridge.mismatch.even_stamps import EvenStamps
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 from pcw_sim_bridge.stamping import StampingParameters
 
 STEP, JITTER = 0.002, 2e-4
+
+
+def even_stamps(stamp: np.ndarray, signals: np.ndarray) -> np.ndarray:
+    return EvenStamps().even("joints", stamp, signals)
 
 
 def motion(time: np.ndarray) -> np.ndarray:
@@ -70,6 +74,26 @@ def test_nobody_can_tell_of_what_stands_still_or_comes_at_any_time() -> None:
     assert even_stamps(wild, signals) is wild
     bursts = np.repeat(wild[::5], 5)[: len(wild)] + 1e-6 * (np.arange(len(wild)) % 5)
     assert even_stamps(bursts, signals) is bursts
+
+
+def test_what_was_said_before_counts_in_a_moment_that_tells_nothing() -> None:
+    _, stamp, signals = readings(7)
+    stamps = EvenStamps()
+    still = 0.0 * signals[:500]
+    assert np.all(stamps.even("joints", stamp[:500], still) == stamp[:500])
+    assert stamps.even("joints", stamp, signals) is not stamp
+    assert np.any(stamps.even("joints", stamp[:500], still) != stamp[:500])
+    assert np.all(stamps.even("imu", stamp[:500], still) == stamp[:500])
+
+
+def test_a_driver_that_begins_to_stamp_what_it_reads_is_believed() -> None:
+    stamps = EvenStamps()
+    _, stamp, signals = readings(8)
+    assert stamps.even("joints", stamp, signals) is not stamp
+    for seed in range(9, 29):
+        _, stamp, signals = readings(seed, when_stamped=True)
+        found = stamps.even("joints", stamp, signals)
+    assert found is stamp
 
 
 def test_a_recording_is_opened_so_and_commands_keep_the_stamps_of_their_states(tmp_path: Path) -> None:

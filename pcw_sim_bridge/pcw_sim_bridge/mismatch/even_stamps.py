@@ -31,47 +31,71 @@ SLOW = 2.0  # [s]; over which clocks that drift are followed
 MOTION = 0.05  # [s]; over which speeds are averaged
 SURE = 0.2  # largest deviation of beta that decides
 LEAST_READINGS = 200
+KEPT = 0.9  # of what earlier recordings of the same robot said; a driver may have been changed
 
 
-def evenly_stamped(recording: Recording) -> Recording:
-    """Return the recording with even stamps of all sensors of which the readings say that they came at even times.
+class EvenStamps:
+    """Gives recordings of one robot even stamps where its readings say that they came at even times.
 
-    Commands that carry the stamps of the states they answer keep them.
+    What they said is kept by sensor: of a second of motion alone few can tell.
     """
-    joints, imu, truth = recording.joint_states, recording.imu, recording.ground_truth
-    moved = copy.copy(recording)
-    stamp = even_stamps(joints.stamp, joints.position.reshape(len(joints.stamp), -1))
-    if stamp is not joints.stamp:
-        moved.joint_states = dataclasses.replace(joints, stamp=stamp)
-        commands = recording.joint_commands
-        if commands is not None and np.mean(np.isin(commands.stamp, joints.stamp)) > 0.5:
-            nearest = np.clip(np.searchsorted(joints.stamp, commands.stamp), 0, len(stamp) - 1)
-            later = np.interp(commands.stamp, joints.stamp, stamp - joints.stamp)
-            answered = np.where(joints.stamp[nearest] == commands.stamp, stamp[nearest], commands.stamp + later)
-            moved.joint_commands = dataclasses.replace(commands, stamp=np.maximum.accumulate(answered))
-    if imu is not None:
-        sensed = np.column_stack([imu.gyro[:, 2], imu.acceleration[:, :2]])
-        if (stamp := even_stamps(imu.stamp, sensed)) is not imu.stamp:
-            moved.imu = dataclasses.replace(imu, stamp=stamp)
-    if truth is not None:
-        pose = truth.pose.copy()
-        pose[:, 2] = np.unwrap(pose[:, 2])
-        if (stamp := even_stamps(truth.stamp, pose)) is not truth.stamp:
-            moved.ground_truth = dataclasses.replace(truth, stamp=stamp)
-    return moved
+
+    def __init__(self) -> None:
+        self._said: dict[str, tuple[float, float]] = {}  # by sensor: precision times beta, and precision
+
+    def evenly_stamped(self, recording: Recording) -> Recording:
+        """Return the recording with even stamps of all sensors of which the readings say so, up to this one.
+
+        Commands that carry the stamps of the states they answer keep them.
+        """
+        joints, imu, truth = recording.joint_states, recording.imu, recording.ground_truth
+        moved = copy.copy(recording)
+        stamp = self.even("joints", joints.stamp, joints.position.reshape(len(joints.stamp), -1))
+        if stamp is not joints.stamp:
+            moved.joint_states = dataclasses.replace(joints, stamp=stamp)
+            commands = recording.joint_commands
+            if commands is not None and np.mean(np.isin(commands.stamp, joints.stamp)) > 0.5:
+                nearest = np.clip(np.searchsorted(joints.stamp, commands.stamp), 0, len(stamp) - 1)
+                later = np.interp(commands.stamp, joints.stamp, stamp - joints.stamp)
+                answered = np.where(joints.stamp[nearest] == commands.stamp, stamp[nearest], commands.stamp + later)
+                moved.joint_commands = dataclasses.replace(commands, stamp=np.maximum.accumulate(answered))
+        if imu is not None:
+            sensed = np.column_stack([imu.gyro[:, 2], imu.acceleration[:, :2]])
+            if (stamp := self.even("imu", imu.stamp, sensed)) is not imu.stamp:
+                moved.imu = dataclasses.replace(imu, stamp=stamp)
+        if truth is not None:
+            pose = truth.pose.copy()
+            pose[:, 2] = np.unwrap(pose[:, 2])
+            if (stamp := self.even("tracker", truth.stamp, pose)) is not truth.stamp:
+                moved.ground_truth = dataclasses.replace(truth, stamp=stamp)
+        return moved
+
+    def even(self, sensor: str, stamp: FloatArray, signals: FloatArray) -> FloatArray:
+        """Return the even times (T,) of readings (T, S), or their stamps (T,) where nobody can tell [s]."""
+        pieces = np.split(np.arange(len(stamp)), np.flatnonzero(np.diff(stamp) > PAUSE) + 1)
+        even = [_even(stamp[piece]) for piece in pieces]
+        told, precision = (KEPT * value for value in self._said.get(sensor, (0.0, 0.0)))
+        for piece, times in zip(pieces, even, strict=True):
+            if times is not None:
+                said = _reading_times(times, stamp[piece] - times.stamp, signals[piece])
+                told, precision = told + said[0], precision + said[1]
+        self._said[sensor] = told, precision
+        if all(times is None for times in even) or precision <= SURE**-2 or told >= 0.5 * precision:
+            return stamp
+        return np.concatenate([stamp[p] if times is None else times.stamp for p, times in zip(pieces, even, strict=True)])
 
 
-def even_stamps(stamp: FloatArray, signals: FloatArray) -> FloatArray:
-    """Return the even times (T,) of readings (T, S), or their stamps (T,) where these say it better or nobody can tell [s]."""
-    pieces = np.split(np.arange(len(stamp)), np.flatnonzero(np.diff(stamp) > PAUSE) + 1)
-    even = [_even(stamp[piece], signals[piece]) for piece in pieces]
-    if all(times is None for times in even):
-        return stamp
-    return np.concatenate([stamp[piece] if times is None else times for piece, times in zip(pieces, even, strict=True)])
+@dataclasses.dataclass(frozen=True)
+class _EvenTimes:
+    """Even stamps (T,) of a piece, which turn each is (T,), and the step between turns [s]."""
+
+    stamp: FloatArray
+    turn: IntArray
+    step: float
 
 
-def _even(stamp: FloatArray, signals: FloatArray) -> FloatArray | None:
-    """The even times of readings without a pause; None where they keep their stamps."""
+def _even(stamp: FloatArray) -> _EvenTimes | None:
+    """The even times of readings without a pause; None where whose turn each is would be a guess."""
     if len(stamp) < LEAST_READINGS:
         return None
     step = float(np.median(np.diff(stamp)))
@@ -85,8 +109,7 @@ def _even(stamp: FloatArray, signals: FloatArray) -> FloatArray | None:
     usual = float(np.sqrt(np.mean(early[near] ** 2))) if near.any() else np.inf
     if np.mean(near) < LEAST_SHARE or usual > USUAL_DIFFERENCE * step or np.any(np.diff(even) <= 0.0):
         return None
-    beta, deviation = _reading_times(turn, early, signals, step)
-    return even if deviation < SURE and beta < 0.5 else None
+    return _EvenTimes(even, turn, step)
 
 
 def _turns(stamp: FloatArray, step: float) -> IntArray:
@@ -104,11 +127,12 @@ def _turns(stamp: FloatArray, step: float) -> IntArray:
     return np.array(turns)
 
 
-def _reading_times(turn: IntArray, early: FloatArray, signals: FloatArray, step: float) -> tuple[float, float]:
-    """Beta of the module and its deviation, by all signals (T, S), each counted by how much it tells."""
+def _reading_times(times: _EvenTimes, early: FloatArray, signals: FloatArray) -> tuple[float, float]:
+    """Precision times beta of the module, and the precision, by all signals (T, S), each counted by how much it tells."""
+    turn, step = times.turn, times.step
     whole = turn[4:] - turn[:-4] == 4
     width = max(3, round(MOTION / step))
-    weight, told = 0.0, 0.0
+    told, precision = 0.0, 0.0
     for values in signals.T:
         known = np.isfinite(values)
         if known.sum() < LEAST_READINGS:
@@ -123,6 +147,6 @@ def _reading_times(turn: IntArray, early: FloatArray, signals: FloatArray, step:
         beta = float(moved @ seen) / size
         noise = float(np.mean((seen - beta * moved) ** 2))
         # Fourth differences of one noise hang together: by so many there are fewer of them than there are samples.
-        precision = size / max(4.0 * noise, 1e-300)
-        told, weight = told + precision * beta, weight + precision
-    return (told / weight, weight**-0.5) if weight > 0.0 else (0.0, np.inf)
+        own = size / max(4.0 * noise, 1e-300)
+        told, precision = told + own * beta, precision + own
+    return told, precision

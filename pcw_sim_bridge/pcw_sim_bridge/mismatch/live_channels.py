@@ -26,6 +26,7 @@ from pcw_description.recording_files import RawMessage
 from pcw_description.robot_description import DRIVE, RobotDescription
 
 from .errors import MismatchError
+from .even_stamps import EvenStamps
 from .live_rows import LONGEST_WINDOW, NANOSECONDS, RowReader, Rows
 from .live_suspects import Suspect, find_suspect
 from .live_tuning import Tuning, digest
@@ -241,9 +242,10 @@ class LiveChannels:
         problems = tuple(str(warning) for warning in fresh.warnings)
         if self._learned() < self.parameters.learning:
             return self._nothing(*problems)
-        recording = Recording.of_messages(self._ring.since(0), self.robot)
+        stamps = EvenStamps()
+        recording = stamps.evenly_stamped(Recording.of_messages(self._ring.since(0), self.robot))
         builder = RobotProblemBuilder(self.robot, [recording], live=True)
-        reader = RowReader(self.robot, builder.cutoff)
+        reader = RowReader(self.robot, builder.cutoff, stamps)
         window = reader.go_on(recording, builder)
         rate = float(np.mean([f.decimated_rate for f in builder.filters]))
         self.tuning = Tuning.learn(digest(self.robot), builder.cutoff, window.layout, window.rows, rate)

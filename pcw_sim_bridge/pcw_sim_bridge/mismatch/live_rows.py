@@ -15,6 +15,7 @@ from pcw_description.recording import Recording
 from pcw_description.recording_files import RawMessage
 from pcw_description.robot_description import RobotDescription
 
+from .even_stamps import EvenStamps
 from .regression_problem import BoolArray, Channel, FloatArray
 from .robot_channels import RobotProblemBuilder
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion
@@ -127,12 +128,14 @@ class RowReader:
     Args:
         robot: the nominal robot.
         cutoff: of the channels' filter [Hz].
+        stamps: what readings said of their times before.
     """
 
-    def __init__(self, robot: RobotDescription, cutoff: float) -> None:
+    def __init__(self, robot: RobotDescription, cutoff: float, stamps: EvenStamps | None = None) -> None:
         self.robot, self.cutoff = robot, cutoff
         self._last_row: float | None = None
         self._yaw: tuple[FloatArray, FloatArray] | None = None  # stamps and yaw of the window before
+        self._stamps = stamps or EvenStamps()
 
     def restart(self) -> None:
         """Take what comes next for another time or place: nothing goes on from the windows before."""
@@ -156,7 +159,7 @@ class RowReader:
         return self._window(*self._opened(messages))
 
     def _opened(self, messages: Sequence[RawMessage]) -> tuple[Recording, RobotProblemBuilder]:
-        recording = Recording.of_messages(messages, self.robot)
+        recording = self._stamps.evenly_stamped(Recording.of_messages(messages, self.robot))
         return recording, RobotProblemBuilder(self.robot, [recording], self.cutoff, live=True)
 
     def go_on(self, recording: Recording, builder: RobotProblemBuilder) -> Window:

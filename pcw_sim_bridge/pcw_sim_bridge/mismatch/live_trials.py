@@ -29,18 +29,23 @@ from pcw_description.robot_file import load_robot
 from pcw_description.ros_messages import imu, joint_state, odometry, serialise, type_name_of
 
 from ..plants.factory import make_plant
-from ..plants.plant import PLANT_NAMES
+from ..plants.plant import PLANT_NAMES, PlantState
 from ..run_controllers import make_controller
 from ..sensors import ImuReading, JointReading
-from ..simulated_robot import SimulatedRobot, TrackedPose
+from ..simulated_robot import JointCommand, SimulatedRobot, TrackedPose
+from ..stamping import HEALTHY, StampingParameters, TopicStamps
 from .live_channels import Judgement, Level, LiveChannels, LiveParameters, header_stamp
 from .live_rows import NANOSECONDS
 
+Content = JointReading | JointCommand | ImuReading | TrackedPose
+TOPICS: Mapping[type[Content], str] = {
+    JointReading: "joint_states", JointCommand: "joint_commands", ImuReading: "imu/data", TrackedPose: "ground_truth/odom",
+}  # fmt: skip
 FORMAT = "pcw_live_trials/1"
 START_NS = NANOSECONDS  # a stamp of zero means "no stamp"
 HEALTHY_DURATION, FAULT_DURATION, FAULT_TIME = 60.0, 50.0, 33.0  # [s]
 # The motions are taken in turn; a fault is looked for in one that never rests.
-HEALTHY_MOTIONS = ("figure8", "random_goals", "chirps", "strafe", "spin", "circle", "steps")
+HEALTHY_MOTIONS = ("figure8", "random_goals", "chirps", "strafe", "spin", "circle", "steps", "identification")
 FAULT_MOTION = "chirps"
 UPDATE_PERIOD = 0.25  # [s]
 
@@ -159,8 +164,9 @@ def messages(
     twist: Callable[[float], FloatArray | None],
     seed: int,
     plant: str = "reduced",
+    stamping: StampingParameters = HEALTHY,
 ) -> Iterator[RawMessage]:
-    """Drive a robot that becomes another one, and yield what it sends.
+    """Drive a robot that becomes another one, and yield what arrives of what it sends.
 
     Args:
         nominal: what its controller believes in.
@@ -168,7 +174,9 @@ def messages(
         twist: time [s] -> twist (3,) wanted.
         seed: of the sensors' noise.
         plant: see `make_plant`.
+        stamping: how the stamps tremble, and what is lost; the controller is on board and loses nothing.
     """
+    stamps = TopicStamps(stamping, seed, nominal)
     controller = make_controller("computed_torque", nominal)
     before, command, begun = None, None, 0.0
     for robot, end in stages:
@@ -181,27 +189,32 @@ def messages(
         offset = round(begun * 1e9)
         while simulated.time_ns + offset < end * 1e9:
             for sample in simulated.advance():
-                now, reading = sample.time_ns + offset, sample.reading
-                stamp = now + START_NS
-                if isinstance(reading, JointReading):
-                    yield _raw("joint_states", stamp, joint_state(
-                        stamp, robot.joint_names, reading.position, reading.velocity, reading.effort
-                    ))  # fmt: skip
-                    command = controller.command(reading, twist(now * 1e-9), simulated.control_period)
+                now = sample.time_ns + offset
+                sent: list[Content] = []
+                if not isinstance(sample.reading, PlantState):
+                    sent.append(sample.reading)
+                if isinstance(sample.reading, JointReading):
+                    command = controller.command(sample.reading, twist(now * 1e-9), simulated.control_period)
                     simulated.command(command)
-                    yield _raw("joint_commands", stamp, joint_state(
-                        stamp, robot.joint_names, velocity=command.velocity, effort=command.effort
-                    ))  # fmt: skip
-                elif isinstance(reading, ImuReading):
-                    yield _raw("imu/data", stamp, imu(stamp, reading.angular_velocity, reading.linear_acceleration))
-                elif isinstance(reading, TrackedPose):
-                    yield _raw("ground_truth/odom", stamp, odometry(stamp, reading.pose, reading.truth.twist))
+                    sent.append(command)
+                for content in sent:
+                    topic = TOPICS[type(content)]
+                    stamp, lost = stamps.stamp(topic, now + START_NS)
+                    if not lost:
+                        message = _message(content, stamp, robot.joint_names)
+                        yield RawMessage(f"/{topic}", type_name_of(message), now + START_NS, serialise(message))
         before, begun = simulated.plant.state(), end
         simulated.close()
 
 
-def _raw(topic: str, stamp: int, message: object) -> RawMessage:
-    return RawMessage(f"/{topic}", type_name_of(message), stamp, serialise(message))
+def _message(content: Content, stamp: int, names: tuple[str, ...]) -> object:
+    if isinstance(content, JointReading):
+        return joint_state(stamp, names, content.position, content.velocity, content.effort)
+    if isinstance(content, JointCommand):
+        return joint_state(stamp, names, velocity=content.velocity, effort=content.effort)
+    if isinstance(content, ImuReading):
+        return imu(stamp, content.angular_velocity, content.linear_acceleration)
+    return odometry(stamp, content.pose, content.truth.twist)
 
 
 # --- Watching -------------------------------------------------------------------------------------------

@@ -3,10 +3,12 @@
 Rows r = N nu + noise with nu ~ Normal(0, D) are collected as information, G = sum N^T W N and g = sum N^T W r with
 W = 1 / slow^2, the power of the slow part of the noise, so that coloured rows do not count for more than they know:
 
-    P = (G + D^-1)^-1,   m = P g,   judged residual = r - N m,   deviation^2 = noise^2 + diag(N P N^T) + (s |measured|)^2
+    P = (G + D^-1)^-1,   m = P g,   judged residual = r - N m,
+    deviation^2 = noise^2 + diag(N (P + u^2 D) N^T) + (s |measured|)^2
 
 What has not been excited yet keeps its tolerance in P, so that a healthy robot stays near one deviation in manoeuvres that
-were not part of the learning. s is the part of the measured side that the model may misjudge.
+were not part of the learning. s is the part of the measured side that the model may misjudge, u (UNSTEADY) the part of its
+tolerance by which no number is steady.
 """
 
 from __future__ import annotations
@@ -33,6 +35,9 @@ FORMAT = "pcw_live_calibration/1"
 ITERATIONS = 8
 # Fewer rows of a channel than this tell nothing of its noise.
 FEWEST_ROWS = 60
+# Part of its tolerance by which a number differs from one motion to another: a tyre's radius with its load, a gain as motors
+# warm up. What was learned of it in one motion is no nearer to the next.
+UNSTEADY = 0.05
 # The floor of today is not that of the day of the calibration, and is counted from another yaw.
 OF_THE_PLACE = "ground.slope"
 
@@ -112,7 +117,8 @@ class Tuning:
 
     def deviation(self, rows: Rows) -> FloatArray:
         """Deviation (T, C) that a healthy robot's residual has in these rows."""
-        unknown = np.einsum("tck,kl,tcl->tc", rows.columns, self.covariance, rows.columns, optimize=True)
+        covariance = self.covariance + np.diag((UNSTEADY * self.layout.deviations) ** 2)
+        unknown = np.einsum("tck,kl,tcl->tc", rows.columns, covariance, rows.columns, optimize=True)
         moved = np.sqrt(np.sum(np.where(rows.valid, rows.measured, 0.0) ** 2, axis=0) / np.maximum(rows.valid.sum(axis=0), 1))
         result: FloatArray = np.sqrt(self.noise**2 + unknown + (self.layout.scale_deviation * moved) ** 2)
         return result

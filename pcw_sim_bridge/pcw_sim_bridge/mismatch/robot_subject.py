@@ -28,7 +28,7 @@ from pcw_description.robot_file import load_robot, robot_to_mapping
 from ..plants.true_robot import as_it_really_is
 from .command_tracking import command_problems
 from .errors import MismatchError
-from .even_stamps import evenly_stamped
+from .even_stamps import EvenStamps
 from .findings import InputFinding
 from .found_effect import effect_instance
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
@@ -73,7 +73,7 @@ class RobotSubject:
             joints = recording.joint_states
             recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
         self._check_sensors(path, recording)
-        recording = evenly_stamped(recording)
+        recording = EvenStamps().evenly_stamped(recording)
         warnings = [f"{warning.topic}: {warning.text}" for warning in found]
         apart = _contradiction(self._seen_robot(), recording)
         if apart > CONTRADICTORY:
