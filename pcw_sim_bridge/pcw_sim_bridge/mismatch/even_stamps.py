@@ -54,7 +54,7 @@ class EvenStamps:
         if stamp is not joints.stamp:
             moved.joint_states = dataclasses.replace(joints, stamp=stamp)
             commands = recording.joint_commands
-            if commands is not None and np.mean(np.isin(commands.stamp, joints.stamp)) > 0.5:
+            if commands is not None and np.isin(commands.stamp, joints.stamp).sum() > 0.5 * len(commands.stamp):
                 nearest = np.clip(np.searchsorted(joints.stamp, commands.stamp), 0, len(stamp) - 1)
                 later = np.interp(commands.stamp, joints.stamp, stamp - joints.stamp)
                 answered = np.where(joints.stamp[nearest] == commands.stamp, stamp[nearest], commands.stamp + later)
