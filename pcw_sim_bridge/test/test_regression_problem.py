@@ -226,6 +226,15 @@ def test_what_a_tolerance_holds_is_no_effect_however_curved(angle, named):
     )
 
 
+def test_what_a_fit_has_itself_counts_against_retuning_and_not_what_it_promises():
+    """Of two zeros off by 16 mrad one was split between effect and number; that promised 22 nats less than it had."""
+    search = EffectSearch(turned_problem(0.2, 0.05), np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.conclude(search.made_exact((Instance(0, (), (0,)),)), 0.5)
+    modest = dataclasses.replace(selection.fit, log_evidence=selection.fit.log_evidence - 30.0)
+    selection = dataclasses.replace(selection, fit=modest)
+    assert search.retuned_away(selection).fit.instances
+
+
 @pytest.mark.parametrize(("angle", "named"), [(0.3, False), (0.7, True), (1.2, True)])
 def test_what_a_part_of_a_tolerance_has_no_room_for_may_be_retuned_by_the_whole(angle, named):
     """Where three wheels were turned by 200 mrad, the tolerances of 20 were narrowed: -27 of one became an effect."""

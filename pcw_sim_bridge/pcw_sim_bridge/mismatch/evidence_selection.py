@@ -169,12 +169,10 @@ class EffectSearch(SetGrowth):
                 instead = selection.regression.fit(others)
             if instead is None:
                 continue
-            evidence = self._exact_evidence(selection.regression, instead)
-            loss = selection.fit.log_evidence - evidence
-            if loss >= selection.threshold:
-                # What a fit promises where it is not exact, re-tuning has not got either.
-                own = self._exact_evidence(selection.regression, selection.fit) if own is None else own
-                loss = own - evidence
+            # Both where they are exact: a fit may promise more than re-tuning gets, or split one cause between an effect and
+            # a number, and promise less than it has itself.
+            own = self._exact_evidence(selection.regression, selection.fit) if own is None else own
+            loss = own - self._exact_evidence(selection.regression, instead)
             if loss < selection.threshold:
                 self.note_drop(self.label(instance), loss, "re-tuning does the same")
                 self._exact_at(instead)

@@ -327,13 +327,12 @@ class RobotProblemBuilder:
         """
         smooth = self.filters if self.layout.balanced else [SignalFilter(f.rate, self.cutoff / SLOWER) for f in self.filters]
 
-        def variable(name: str, values: FloatArray, own: SignalFilter, slower: SignalFilter) -> FloatArray:
-            return own.decimate(values if name == "time" else slower.smooth(values))
-
-        return {
-            name: np.concatenate([variable(name, *piece) for piece in zip(parts, self.filters, smooth, strict=True)])
-            for name, parts in along.items()
-        }
+        pieces = []
+        for k, (own, slower) in enumerate(zip(self.filters, smooth, strict=True)):
+            signals = np.stack([parts[k] for parts in along.values()], axis=1)
+            timed = [name == "time" for name in along]
+            pieces.append(own.decimate(np.where(timed, signals, slower.smooth(signals))))
+        return dict(zip(along, np.concatenate(pieces).T, strict=True))
 
     def _sites(self, differences: ChannelDifferences, along: Mapping[str, Sequence[FloatArray]]) -> Sites:
         """Where an unknown torque or force may act: every joint, and forces and a moment on the chassis."""
