@@ -110,6 +110,13 @@ def test_a_push_is_told_from_casters(learned: Tuning) -> None:
     assert last.suspect is not None and last.suspect.told and last.suspect.place == "chassis"
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_window_in_which_nothing_can_be_judged_says_nothing(friction: list[RawMessage]) -> None:
+    reader = RowReader(THESIS, 3.0)  # its filter settles for 0.8 s at either end
+    window = reader.read([message for message in friction if 4.0e9 < message.log_time_ns < 5.2e9])
+    assert not len(window.rows)
+
+
 def test_a_saved_calibration_judges_from_the_start(learned: Tuning, friction: list[RawMessage], tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
     learned.save(path)

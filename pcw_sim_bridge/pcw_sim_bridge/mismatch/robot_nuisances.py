@@ -67,7 +67,7 @@ def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) ->
 
 def _misjudged(number: VariedNumber, column: FloatArray, differences: ChannelDifferences) -> float:
     """Change of a small inertia that does to the forces what the model misjudges of them: it is known no better by them."""
-    if not number.label.startswith(INERTIAS):
+    if not number.label.startswith(INERTIAS) or not len(column):
         return 0.0
     size = float(np.sqrt(np.mean(column[:, :3] ** 2)))
     forces = float(np.sqrt(np.mean(differences.measured[:, :3] ** 2)))
