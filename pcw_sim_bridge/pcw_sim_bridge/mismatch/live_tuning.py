@@ -1,14 +1,15 @@
 """What a running robot has shown of its own numbers: re-tuning inside the tolerances, and the noise that remains.
 
 Rows r = N nu + noise with nu ~ Normal(0, D) are collected as information, G = sum N^T W N and g = sum N^T W r with
-W = 1 / slow^2, the power of the slow part of the noise, so that coloured rows do not count for more than they know:
+W = 1 / (slow^2 + N U N^T + (s |measured|)^2), slow^2 the power of the slow part of the noise, so that coloured rows, and rows
+that the model misjudges, do not count for more than they know:
 
     P = (G + D^-1)^-1,   m = P g,   judged residual = r - N m,
-    deviation^2 = noise^2 + diag(N (P + u^2 D) N^T) + (s |measured|)^2
+    deviation^2 = noise^2 + diag(N (P + U) N^T) + (s |measured|)^2
 
 What has not been excited yet keeps its tolerance in P, so that a healthy robot stays near one deviation in manoeuvres that
-were not part of the learning. s is the part of the measured side that the model may misjudge, u (UNSTEADY) the part of its
-tolerance by which no number is steady.
+were not part of the learning. s is the part of the measured side that the model may misjudge, U the variances than which no
+number is steadier, each of a part of its tolerance.
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ FEWEST_ROWS = 60
 # Part of its tolerance by which a number differs from one motion to another: a tyre's radius with its load, a gain as motors
 # warm up. What was learned of it in one motion is no nearer to the next.
 UNSTEADY = 0.05
+# The same of numbers of the tyres. Their columns are those of the description, and slips are curved in them: the more a wheel
+# has to hold, the less the first order knows of a tyre that is off by a part of its wide tolerance.
+CURVED, UNSTEADY_TYRES = "contact.", 0.3
 # The floor of today is not that of the day of the calibration, and is counted from another yaw.
 OF_THE_PLACE = "ground.slope"
 
@@ -65,6 +69,8 @@ class Tuning:
 
     def __post_init__(self) -> None:
         """Compute the posterior."""
+        tyres = np.array([name.startswith(CURVED) for name in self.layout.nuisances])
+        self._unsteady: FloatArray = np.where(tyres, UNSTEADY_TYRES, UNSTEADY) * self.layout.deviations
         self._update()
 
     def _update(self) -> None:
@@ -117,16 +123,20 @@ class Tuning:
 
     def deviation(self, rows: Rows) -> FloatArray:
         """Deviation (T, C) that a healthy robot's residual has in these rows."""
-        covariance = self.covariance + np.diag((UNSTEADY * self.layout.deviations) ** 2)
-        unknown = np.einsum("tck,kl,tcl->tc", rows.columns, covariance, rows.columns, optimize=True)
-        moved = np.sqrt(np.sum(np.where(rows.valid, rows.measured, 0.0) ** 2, axis=0) / np.maximum(rows.valid.sum(axis=0), 1))
-        result: FloatArray = np.sqrt(self.noise**2 + unknown + (self.layout.scale_deviation * moved) ** 2)
+        unknown = np.einsum("tck,kl,tcl->tc", rows.columns, self.covariance, rows.columns, optimize=True)
+        result: FloatArray = np.sqrt(self.noise**2 + unknown + self._misjudged(rows))
         return result
+
+    def _misjudged(self, rows: Rows) -> FloatArray:
+        """Variance (T, C) from which nothing can be learned: what is not steady, and what the model neglects."""
+        moved = np.sqrt(np.sum(np.where(rows.valid, rows.measured, 0.0) ** 2, axis=0) / np.maximum(rows.valid.sum(axis=0), 1))
+        variance: FloatArray = rows.columns**2 @ self._unsteady**2 + (self.layout.scale_deviation * moved) ** 2
+        return variance
 
     def include(self, rows: Rows) -> None:
         """Learn from rows of a healthy robot."""
         standard = self.residual(rows) / self.deviation(rows)
-        weight = np.where(rows.valid, huber_weights(standard), 0.0) / self.slow**2
+        weight = np.where(rows.valid, huber_weights(standard), 0.0) / (self.slow**2 + self._misjudged(rows))
         weighted = rows.columns * weight[:, :, None]
         self.information += np.einsum("tck,tcl->kl", weighted, rows.columns, optimize=True)
         self.moment += np.einsum("tck,tc->k", weighted, rows.residual)
