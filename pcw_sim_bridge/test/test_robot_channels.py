@@ -130,6 +130,24 @@ def test_a_healthy_robot_leaves_next_to_nothing(tmp_path: Path, plant: str) -> N
     assert np.all(residual[-3:] < 8e-3)
 
 
+@pytest.mark.parametrize(("sensor", "pause"), [("imu", 0.06), ("imu", 0.5), ("ground_truth", 0.3)])
+def test_a_pause_of_a_sensor_reaches_nothing_beside_it(tmp_path: Path, sensor: str, pause: float) -> None:
+    """In its place stood zeros: a turning robot's gyro was off by tenths of its speed for half a second on either side."""
+    whole = record(tmp_path, THESIS, 1, twist=lambda time: min(time, 1.0) * np.array([0.3, 0.0, 0.6]))
+    paused = copy.copy(whole)
+    series = getattr(whole, sensor)
+    kept = (series.stamp < 8.0) | (series.stamp > 8.0 + pause)
+    here = {f.name: getattr(series, f.name) for f in dataclasses.fields(series)}
+    cut = {name: value[kept] for name, value in here.items() if isinstance(value, np.ndarray) and len(value) == len(kept)}
+    setattr(paused, sensor, dataclasses.replace(series, **cut))
+    plain, problem = (RobotProblemBuilder(THESIS, [run]).build(with_terms=False) for run in (whole, paused))
+    felt = slice(11, 14) if sensor == "imu" else slice(14, 17)
+    judged = problem.valid[:, felt]
+    assert judged.any(axis=0).all() and not judged.all()
+    sizes = [np.abs(np.where(judged, own.residual[:, felt], 0.0)).max(axis=0) for own in (plain, problem)]
+    np.testing.assert_array_less(sizes[1], 2.0 * sizes[0])
+
+
 def test_a_changed_number_is_its_nuisance(tmp_path: Path) -> None:
     """3 kg more chassis and a wheel heading read 20 mrad wrong come out with their size, through their own columns."""
     nominal = load_robot("thesis")

@@ -44,8 +44,9 @@ class ChannelDifferences:
             self._around.append(known)
         self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
         self.known = [np.isfinite(measured) for measured, _ in self._sides]
-        self.measured = self.filtered([np.nan_to_num(measured) for measured, _ in self._sides])
-        self.predicted = self.filtered([predicted for _, predicted in self._sides])
+        # Where a sensor paused stands what it would have measured: a zero there would reach samples beside it by the filter.
+        sides = [(np.where(there, *both), both[1]) for there, both in zip(self.known, self._sides, strict=True)]
+        self.measured, self.predicted = (self.filtered(pieces) for pieces in zip(*sides, strict=True))
         self.residual = self.measured - self.predicted
         self._responses: list[TorqueResponse] | None = None
 
