@@ -148,6 +148,19 @@ def test_a_pause_of_a_sensor_reaches_nothing_beside_it(tmp_path: Path, sensor: s
     np.testing.assert_array_less(sizes[1], 2.0 * sizes[0])
 
 
+def test_a_piece_too_short_for_the_filter_is_left_out(tmp_path: Path) -> None:
+    """Between two pauses of the joints lies less than the filter needs: ``mismatch analyze`` ended with a traceback."""
+    recording = copy.copy(record(tmp_path, THESIS, 1))
+    joints = recording.joint_states
+    kept = ~((joints.stamp > 8.0) & (joints.stamp < 8.3)) & ~((joints.stamp > 9.5) & (joints.stamp < 9.8))
+    fields = {name: getattr(joints, name)[kept] for name in ("stamp", "stamp_ns", "position", "velocity", "effort")}
+    recording.joint_states = dataclasses.replace(joints, **fields)
+    builder = RobotProblemBuilder(THESIS, [recording], 3.0)
+    problem = builder.build()
+    assert [bool(len(f.decimate(m.time))) for f, m in zip(builder.filters, builder.motions, strict=True)] == [True, False, True]
+    assert problem.valid.any() and np.isfinite(problem.residual).all()
+
+
 def test_a_changed_number_is_its_nuisance(tmp_path: Path) -> None:
     """3 kg more chassis and a wheel heading read 20 mrad wrong come out with their size, through their own columns."""
     nominal = load_robot("thesis")

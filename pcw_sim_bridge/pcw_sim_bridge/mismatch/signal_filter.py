@@ -22,7 +22,7 @@ FILTER_ORDER = 4
 OVERSAMPLING = 2.5
 # A step of more median ones than the first is a gap, as samples are missing in it; one of the second may always be filled.
 GAP_STEPS, FILLED_STEPS = 1.5, 3.0
-# So much of what belongs on either side of a gap, as long as it, must be there to fill it.
+# So much of what belongs on either side of a gap, for as long as the largest that is filled, must be there to fill it.
 SURROUNDED = 0.5
 # Samples that are so many times rarer than what is asked for are a slow sensor's.
 SLOW_STEPS = 1.5
@@ -247,8 +247,8 @@ def _is_pause(time: FloatArray, largest_gap: float) -> BoolArray:
     step = float(np.median(steps))
     pause: BoolArray = steps > max(largest_gap, FILLED_STEPS * step)
     for index in np.flatnonzero(~pause & (steps > GAP_STEPS * step)):
-        gap = steps[index]
-        before = index + 1 - np.searchsorted(time, time[index] - gap)
-        after = np.searchsorted(time, time[index + 1] + gap, side="right") - (index + 1)
-        pause[index] = min(before, after) < SURROUNDED * gap / step
+        reach = max(steps[index], largest_gap)
+        before = index + 1 - np.searchsorted(time, time[index] - reach)
+        after = np.searchsorted(time, time[index + 1] + reach, side="right") - (index + 1)
+        pause[index] = min(before, after) < SURROUNDED * reach / step
     return pause

@@ -33,6 +33,7 @@ FRICTION_SPEED = 0.05  # [rad/s], at which dry friction reverses
 RIDGE = 1e-6  # of what a number explains, so that numbers which are the same thing share it
 SLOW = 0.4  # [s]; errors fluctuate faster than robots move, and than most of what depends on how they move
 FLUCTUATES = 0.75  # of the part that is faster in white errors; of what holds less of it, missing physics is a part
+LEAST_STAMPS = 2  # of a piece; between one and none there is nothing to interpolate
 LEAST_ROWS = 200  # of the balance; fewer tell no errors from masses and frictions
 
 
@@ -54,6 +55,10 @@ def with_balanced_torques(
     found, start = [], 0
     for motion, own, of_torque in zip(read, differences.filters, maps, strict=True):
         stamps, there = own.decimate(motion.time), own.decimate(of_torque)  # (T, 3, n, 2)
+        if len(stamps) < LEAST_STAMPS:
+            found.append(motion)
+            start += len(stamps)
+            continue
         here = slice(start, start + len(stamps))
         rows, start = left[here], start + len(stamps)
         if not motion.reported.any():
