@@ -136,7 +136,7 @@ def test_a_gap_is_filled_beside_what_was_not_recorded_and_left_open_among_others
 
 
 def test_losses_close_to_one_another_do_not_cut_a_recording() -> None:
-    """Of two messages lost beside each other one was a pause, if a third was lost nearby: 2 % lost cost seconds at every cut."""
+    """Of two messages lost beside each other one was a pause, if a third was lost nearby: 2 % cost seconds at every cut."""
     rng = np.random.default_rng(4)
     time = np.arange(0.0, 60.0, 0.002)
     swing = np.sin(2.0 * np.pi * 1.5 * time)
