@@ -100,8 +100,11 @@ def analyse(
     """
     begun = time.monotonic()
     progress(f"reading {len(fit) + len(holdout)} recording(s)")
-    opened = [subject.open(path, "fit", topics) for path in fit]
-    held_out = [subject.open(path, "holdout", topics) for path in holdout]
+    opened, left_out = subject.part_of([subject.open(path, "fit", topics) for path in fit], "searched")
+    held_out, unproved = subject.part_of([subject.open(path, "holdout", topics) for path in holdout], "held out")
+    lengths = tuple(told for told in (left_out, unproved) if told)
+    for told in lengths:
+        progress(told)
     once = "; its model is compiled first, once after an installation" if subject.awaits_compiling() else ""
     progress(f"building the channels{once}")
     problem = subject.problem(opened)
@@ -113,7 +116,7 @@ def analyse(
             f"only {usable:.1f} s of usable motion (moving, no gross slip), {100 * judged.mean():.0f} % of what was recorded; "
             f"at least {LEAST_DURATION:g} s are needed, and {100 * LEAST_UNDISTURBED:.0f} % where wheels shake"
         )
-        notes = (note, *problem.remarks)
+        notes = (note, *lengths, *problem.remarks)
         empty = Findings(
             subject.name, "insufficient_data", inputs, (), (), (), (), (), None, (), (), notes, time.monotonic() - begun
         )
@@ -169,7 +172,7 @@ def analyse(
             *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
             *(_traces(other, proof.predicted, explanation.fit, "holdout") if other is not None else ()),
         ),
-        notes=(*crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes),
+        notes=(*lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),

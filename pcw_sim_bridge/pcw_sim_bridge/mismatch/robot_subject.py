@@ -31,6 +31,7 @@ from .errors import MismatchError
 from .even_stamps import EvenStamps
 from .findings import InputFinding
 from .found_effect import effect_instance
+from .long_recordings import part_of
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
@@ -115,6 +116,11 @@ class RobotSubject:
                 raise MismatchError(
                     f"{lacks} has no {name}, and {has} has; allowed: recordings with the same sensors in one analysis"
                 )
+
+    def part_of(self, opened: Sequence[Opened], use: str) -> tuple[Sequence[Opened], str]:
+        """Return recordings of some minutes together; see `long_recordings`."""
+        parts, told = part_of([o.recording for o in opened], use)
+        return [dataclasses.replace(o, recording=part) for o, part in zip(opened, parts, strict=True)], told
 
     def awaits_compiling(self) -> bool:
         """Return whether the channels' model was not used on this machine before."""

@@ -37,6 +37,9 @@ class Subject(Protocol):
             PcwError: it cannot be read; the message names it and says what is wrong.
         """
 
+    def part_of(self, opened: Sequence[Opened], use: str) -> tuple[Sequence[Opened], str]:
+        """Return recordings with as much of them as can be used at once, and a sentence on that, empty where it is all."""
+
     def awaits_compiling(self) -> bool:
         """Return whether the first problem will take seconds longer than any later one on this machine."""
 
