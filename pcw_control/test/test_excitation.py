@@ -15,6 +15,10 @@ from pcw_description.differential_kinematics import inverse_kinematics
 
 ROBOTS = {name: load_robot(name) for name in shipped_robots() if name != "mpo700"}
 THESIS = ROBOTS["thesis"]
+DAILY_AND_NIGHTLY = [
+    pytest.param(robot, id=name, marks=() if name in ("thesis", "tidybot2") else pytest.mark.nightly)
+    for name, robot in ROBOTS.items()
+]
 # The two that are the same for every robot rely on the controller to slow them down.
 FITTED = [name for name in EXCITATIONS if name not in ("identification", "holdout")]
 STEP = 0.002
@@ -46,7 +50,7 @@ def joint_speeds(robot, twist, heading, step):
     return np.array(speeds)
 
 
-@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+@pytest.mark.parametrize("robot", DAILY_AND_NIGHTLY)
 @pytest.mark.parametrize("name", FITTED)
 def test_no_joint_is_asked_for_more_than_its_share_of_speed_and_torque(robot, name):
     """Every second caster begins all but the wrong way round, and has to turn at once."""

@@ -703,7 +703,10 @@ HEALTHY: list[Callable[[Drive, np.random.Generator], Drive]] = [
 ]
 
 
-@pytest.mark.parametrize("seed", range(3))
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("variant", HEALTHY, ids=lambda f: getattr(f, "__name__", ""))
 @pytest.mark.parametrize("name", ["thesis", "tidybot2"])
 def test_a_healthy_recording_passes_without_a_warning(
@@ -969,7 +972,7 @@ UNIT_FAULTS: dict[str, tuple[float, float, str]] = {
 
 @pytest.mark.parametrize("axes", [(DRIVE,), (STEER,), (DRIVE, STEER)], ids=["drive", "steer", "both"])
 @pytest.mark.parametrize("fault", UNIT_FAULTS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_wrong_units_are_named_and_converted(
     robot: RobotDescription, tmp_path: Path, fault: str, axes: tuple[int, ...], seed: int
 ) -> None:

@@ -19,6 +19,7 @@ DURATION, PERIOD = 30.0, 0.005
 PAIRS = list(itertools.combinations(all_effects(), 2))
 SEED = 20
 CHOSEN = [PAIRS[i] for i in sorted(np.random.default_rng(SEED).choice(len(PAIRS), 30, replace=False))]
+DAILY = CHOSEN[::3]
 
 
 def magnitude(effect: Effect, rng: np.random.Generator) -> dict[str, float]:
@@ -58,7 +59,10 @@ def drive_about(plant_name: str, names: tuple[str, ...], seed: int, duration: fl
         plant.close()
 
 
-@pytest.mark.parametrize("names", CHOSEN, ids="+".join)
+@pytest.mark.parametrize(
+    "names",
+    [pytest.param(names, id="+".join(names), marks=() if names in DAILY else pytest.mark.nightly) for names in CHOSEN],
+)
 def test_a_pair_of_effects_runs(names: tuple[str, str]) -> None:
     """A seeded choice of thirty pairs."""
     drive_about("reduced", names, seed=1)

@@ -28,14 +28,14 @@ def explained(case: BenchCase) -> Explanation:
     return explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(6, 12))])
 def test_nothing_is_named_where_nothing_is_missing(seed):
     """Any motion, any colour of noise, an inertia off by as much as its tolerance says."""
     explanation = explained(draw_bench_case(np.random.default_rng([seed, 7])))
     assert [entry.term.effect for entry in explanation.named] == []
 
 
-@pytest.mark.parametrize("motion", ["sines", "chirp"])
+@pytest.mark.parametrize("motion", ["sines", pytest.param("chirp", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_an_effect_alone_is_named_with_its_size(effect, motion):
     case = draw_bench_case(np.random.default_rng([len(effect), len(motion)]), [effect], 0.4, motion)

@@ -59,6 +59,12 @@ def record(
     return Recording.open(path, load_robot("thesis"))
 
 
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The robot as it is described; a test that changes the recording takes a copy."""
+    return record(tmp_path_factory.mktemp("healthy"), THESIS, 5)
+
+
 def column_fit(builder: RobotProblemBuilder, column: np.ndarray) -> tuple[float, float]:
     """Return the least-squares coefficient of one column (T, C) in the wrench, and the share of power it explains there."""
     problem = builder.build(with_terms=False)
@@ -90,9 +96,9 @@ def test_zeros_as_numbers_and_as_effects_are_one_thing_also_where_nothing_tracks
     assert sizes[2] < 0.02 * sizes[1]
 
 
-def test_wheels_that_spin_all_together_are_told_by_what_else_feels_the_motion(tmp_path: Path) -> None:
+def test_wheels_that_spin_all_together_are_told_by_what_else_feels_the_motion(healthy: Recording) -> None:
     """No wheel contradicted the others when all of them turned about at once: half a second was all of the error."""
-    builder = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 4)])
+    builder = RobotProblemBuilder(THESIS, [healthy])
     [motion] = builder.motions
     before = sliding(builder.numbers, motion, builder.layout)
     spinning = (motion.time > 8.0) & (motion.time < 8.4)
@@ -148,9 +154,9 @@ def test_a_pause_of_a_sensor_reaches_nothing_beside_it(tmp_path: Path, sensor: s
     np.testing.assert_array_less(sizes[1], 2.0 * sizes[0])
 
 
-def test_a_piece_too_short_for_the_filter_is_left_out(tmp_path: Path) -> None:
+def test_a_piece_too_short_for_the_filter_is_left_out(healthy: Recording) -> None:
     """Between two pauses of the joints lies less than the filter needs: ``mismatch analyze`` ended with a traceback."""
-    recording = copy.copy(record(tmp_path, THESIS, 1))
+    recording = copy.copy(healthy)
     joints = recording.joint_states
     kept = ~((joints.stamp > 8.0) & (joints.stamp < 8.3)) & ~((joints.stamp > 9.5) & (joints.stamp < 9.8))
     fields = {name: getattr(joints, name)[kept] for name in ("stamp", "stamp_ns", "position", "velocity", "effort")}
@@ -225,11 +231,11 @@ def test_rotors_of_coupled_gears_are_wrong_at_both_joints(rotor: str) -> None:
         "drive_coulomb_friction",
     ],
 )
-def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, changed: str) -> None:
+def test_columns_are_slopes_also_where_numbers_have_moved_far(healthy: Recording, changed: str) -> None:
     """An inertia that was scaled, not added to, lost 57 % of its column with 57 % of itself, and what a torque does to the
     slips of a soft tyre was that of the described one: a search that made its problem exact there ran from its own optimum.
     """
-    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 5)]).build()
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
     numbers = {nuisance.name: nuisance for nuisance in problem.nuisances}
     [index] = [k for k, t in enumerate(problem.terms) if (t.effect, t.target) == ("drive_coulomb_friction", ("rear_left",))]
     shape = tuple(sorted(problem.terms[index].shapes[0].items()))
@@ -263,9 +269,9 @@ def test_columns_are_slopes_also_where_numbers_have_moved_far(tmp_path: Path, ch
         assert off <= most * size, problem.channels[channel].name
 
 
-def test_how_wheels_move_is_taken_over_only_where_they_move_so(tmp_path: Path) -> None:
+def test_how_wheels_move_is_taken_over_only_where_they_move_so(healthy: Recording) -> None:
     """Of every number of the model and all that surroundings hold: channels are those that nothing known before makes."""
-    builder = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 1)], 5.0)
+    builder = RobotProblemBuilder(THESIS, [healthy], 5.0)
     motion, numbers, layout = builder.motions[0], builder.numbers, builder.layout
     known = Surroundings(wheels=wheel_motion(motion, numbers))
     shape = motion.position.shape
@@ -287,9 +293,9 @@ def test_how_wheels_move_is_taken_over_only_where_they_move_so(tmp_path: Path) -
         assert all(np.array_equal(a, b) for a, b in zip(channel_sides(moved, other, layout, around), anew, strict=True))
 
 
-def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_does(tmp_path: Path) -> None:
+def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_does(healthy: Recording) -> None:
     """Its slips stayed those of the described tyres: friction by the angle of all steerings passed for a Coulomb friction."""
-    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 5)]).build()
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
     [tyres] = [number for number in problem.nuisances if number.name == "contact.stiffness"]
     softer = problem.exact_at({tyres.name: 0.4 * tyres.nominal}, ()).with_soft_tyres()
     assert softer.sites is not None
@@ -300,9 +306,9 @@ def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_doe
     assert softer.sites.columns(torque)[:, :, 0] == pytest.approx(term.columns(term.shapes[0])[:, :, 0], rel=1e-9, abs=1e-12)
 
 
-def test_a_centre_of_mass_is_felt_as_a_moment_on_a_floor_that_leans(tmp_path: Path) -> None:
+def test_a_centre_of_mass_is_felt_as_a_moment_on_a_floor_that_leans(healthy: Recording) -> None:
     """Without it a payload's place was told from the chassis' centre of mass, with intervals that held neither."""
-    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 5)]).build()
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
     [moment] = [k for k, channel in enumerate(problem.channels) if channel.name == "chassis_torque/z"]
     angle, valid = 0.02, problem.valid[:, moment]
 
@@ -331,9 +337,9 @@ def test_shapes_go_by_the_slopes_of_the_model_to_where_it_costs_least(tmp_path: 
     assert found.fit.mean[-1] == pytest.approx(payload["mass"], rel=0.1)
 
 
-def test_scales_of_an_imu_are_numbers_too(tmp_path: Path) -> None:
+def test_scales_of_an_imu_are_numbers_too(healthy: Recording) -> None:
     """Accelerometers half a percent off were parts of a gyroscope's error, with intervals as if nobody allowed them any."""
-    problem = RobotProblemBuilder(THESIS, [record(tmp_path, THESIS, 9)]).build()
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
     numbers = {nuisance.name: nuisance for nuisance in problem.nuisances}
     [term] = [term for term in problem.terms if term.effect == "imu_scale"]
     for k, name in enumerate(("imu.gyro_scale", "imu.accelerometer_scale.x", "imu.accelerometer_scale.y")):
@@ -342,9 +348,9 @@ def test_scales_of_an_imu_are_numbers_too(tmp_path: Path) -> None:
         assert np.linalg.norm(effect - number) < 0.05 * np.linalg.norm(effect)
 
 
-def test_slips_lag_as_torques_do(tmp_path: Path) -> None:
+def test_slips_lag_as_torques_do(healthy: Recording) -> None:
     """All torques told a cycle later: what that does is the column of their lag, in the slips of the wheels, too."""
-    recording = record(tmp_path, THESIS, 8)
+    recording = healthy
     later = copy.copy(recording)
     joints, commands = recording.joint_states, recording.joint_commands
     assert joints.effort is not None and commands is not None and commands.effort is not None
@@ -462,9 +468,9 @@ def test_a_chassis_that_stands_askew_leans_its_steerings(tmp_path: Path, entry: 
     assert np.all(right < 1.4)
 
 
-def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(tmp_path: Path) -> None:
+def test_a_robot_without_offset_is_judged_by_its_inertial_sensor_alone(healthy: Recording) -> None:
     """b_x = 0 leaves no torque balance; the channels say so by their names, and no candidate is a torque."""
-    recording = record(tmp_path, load_robot("thesis"), 5)
+    recording = healthy
     swerve = load_robot("thesis")
     swerve = dataclasses.replace(
         swerve,
@@ -640,11 +646,11 @@ def test_tyres_that_differ_are_not_said_to_relax_alike(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path) -> None:
+def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path, healthy: Recording) -> None:
     """Exact where it was at work in the second, the model leaves the first as it was, and less of the second."""
     push = {"name": "external_push", "target": ["chassis"], "force_x": 40.0, "start": 5.0, "duration": 2.0}
     pushed = dataclasses.replace(THESIS, physics=read_physics([push], THESIS.caster_names))
-    recordings = [record(tmp_path, THESIS, 11), record(tmp_path, pushed, 12)]
+    recordings = [healthy, record(tmp_path, pushed, 12)]
     problem = RobotProblemBuilder(THESIS, recordings).build()
     keys = [term.key for term in problem.terms]
     assert keys.count("external_push/chassis") == 1

@@ -39,6 +39,12 @@ def simulated(folder: Path, *arguments: str, excite="chirps", duration="10", see
     return Recording.open(out, THESIS)
 
 
+@pytest.fixture(scope="module")
+def ideal(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The default run without noise of stamps and losses."""
+    return simulated(tmp_path_factory.mktemp("ideal"), "--ideal")
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -73,8 +79,8 @@ def test_a_robot_without_an_imu_leaves_no_imu_topic(tmp_path):
     assert Recording.open(out, load_robot("xr4000")).imu is None
 
 
-def test_by_default_stamps_jitter_and_messages_are_lost(tmp_path):
-    ideal, real = simulated(tmp_path / "ideal", "--ideal"), simulated(tmp_path / "real", "--loss", "0.01")
+def test_by_default_stamps_jitter_and_messages_are_lost(ideal, tmp_path):
+    real = simulated(tmp_path, "--loss", "0.01")
     lost = 1.0 - len(real.joint_states) / len(ideal.joint_states)
     assert 0.001 < lost < 0.03
     # The readings themselves are those of the ideal run: only stamps and losses are added.
@@ -102,9 +108,9 @@ def test_physics_is_at_work_and_the_controller_does_not_know(tmp_path):
     friction = "{name: drive_coulomb_friction, target: [front_left], coulomb: 1.0}"
     file = tmp_path / "effects.yaml"
     file.write_text(yaml.safe_dump({"physics": [yaml.safe_load(friction)]}), encoding="utf-8")
-    healthy = simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="20")
+    healthy = simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="15")
     inline, from_file, listed = (
-        simulated(tmp_path / name, "--ideal", "--physics", given, excite="circle", duration="20")
+        simulated(tmp_path / name, "--ideal", "--physics", given, excite="circle", duration="15")
         for name, given in (("inline", friction), ("file", str(file)), ("list", f"[{friction}]"))
     )
     assert digest(tmp_path / "inline/bag") == digest(tmp_path / "file/bag") == digest(tmp_path / "list/bag")
