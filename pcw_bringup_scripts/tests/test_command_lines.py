@@ -36,7 +36,13 @@ def run(folder: Path, package: str, name: str, *arguments: str) -> subprocess.Co
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("package", "name", "module"), EXECUTABLES)
+@pytest.mark.parametrize(
+    ("package", "name", "module"),
+    [
+        pytest.param(*entry, marks=() if entry in NODES or k % 3 == 0 else pytest.mark.nightly)
+        for k, entry in enumerate(EXECUTABLES)
+    ],
+)
 def test_help_is_printed_and_nothing_is_done(tmp_path, package, name, module):
     """`--help` of a recorder made a folder and recorded, that of a controller drove."""
     done = run(tmp_path, package, name, "--help")

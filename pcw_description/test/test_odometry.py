@@ -83,7 +83,9 @@ def run(
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize(
+    "name", ["figure_8", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("circle", "spin"))]
+)
 def test_the_pose_converges_at_second_order(name: str, method: str) -> None:
     """Twice the rate, a quarter of the error, while the casters swing into the motion; and 0.1 mm at 500 Hz.
 

@@ -141,7 +141,10 @@ def torque_change(healthy: SimulatedRecording, effects: list[EffectInstance]) ->
     return float(np.sqrt(np.mean((after - before) ** 2)) / np.std(before))
 
 
-@pytest.mark.parametrize("name", sorted(OUTSIDE_EFFECTS))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.nightly if k % 3 else ()) for k, name in enumerate(sorted(OUTSIDE_EFFECTS))],
+)
 def test_what_is_outside_the_library_is_at_work_and_not_in_it(name: str, healthy: SimulatedRecording, scene: Scene) -> None:
     effect = draw_effect(name, scene, 1.0).instance()
     assert torque_change(healthy, [effect]) > 0.01

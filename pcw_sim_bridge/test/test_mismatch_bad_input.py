@@ -155,7 +155,7 @@ def without_imu(drive: Drive) -> Drive:
         pytest.param(repeats, "stamp", marks=pytest.mark.nightly),
         pytest.param(backward, "back", marks=pytest.mark.nightly),
         pytest.param(not_a_number, "NaN", marks=pytest.mark.nightly),
-        (degrees, "degrees"),
+        pytest.param(degrees, "degrees", marks=pytest.mark.nightly),
         pytest.param(revolutions_per_minute, "rpm", marks=pytest.mark.nightly),
         pytest.param(velocity_in_counts, "counts", marks=pytest.mark.nightly),
         pytest.param(without_truth, "", marks=pytest.mark.nightly),

@@ -48,9 +48,9 @@ def ideal(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 @pytest.mark.parametrize(
     "arguments",
     [
-        pytest.param([], marks=pytest.mark.nightly),
+        [],
         pytest.param(["--controller", "velocity_loops"], marks=pytest.mark.nightly),
-        ["--plant", "pybullet", "--ideal"],
+        pytest.param(["--plant", "pybullet", "--ideal"], marks=pytest.mark.nightly),
     ],
 )
 def test_the_same_arguments_give_the_same_bytes(tmp_path, arguments):
@@ -108,9 +108,9 @@ def test_physics_is_at_work_and_the_controller_does_not_know(tmp_path):
     friction = "{name: drive_coulomb_friction, target: [front_left], coulomb: 1.0}"
     file = tmp_path / "effects.yaml"
     file.write_text(yaml.safe_dump({"physics": [yaml.safe_load(friction)]}), encoding="utf-8")
-    healthy = simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="15")
+    healthy = simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="20")
     inline, from_file, listed = (
-        simulated(tmp_path / name, "--ideal", "--physics", given, excite="circle", duration="15")
+        simulated(tmp_path / name, "--ideal", "--physics", given, excite="circle", duration="20")
         for name, given in (("inline", friction), ("file", str(file)), ("list", f"[{friction}]"))
     )
     assert digest(tmp_path / "inline/bag") == digest(tmp_path / "file/bag") == digest(tmp_path / "list/bag")
