@@ -82,12 +82,12 @@ def test_every_one_of_several_gives_its_share() -> None:
 
 def test_a_problem_is_made_of_the_stretches_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between them nothing is filled: each is a piece of its own."""
-    monkeypatch.setattr("pcw_sim_bridge.mismatch.long_recordings.STRETCH", 4.0)
-    record_run(THESIS, lambda time: min(time, 1.0) * np.array([0.3 * np.sin(time), 0.2, 0.4]), 24.0, 1, tmp_path / "run")
+    monkeypatch.setattr("pcw_sim_bridge.mismatch.long_recordings.STRETCH", 2.0)
+    record_run(THESIS, lambda time: min(time, 1.0) * np.array([0.3 * np.sin(time), 0.2, 0.4]), 12.0, 1, tmp_path / "run")
     recording = RobotSubject(THESIS).open(tmp_path / "run", "fit", {}).recording
-    [part], _ = part_of([recording], "searched", 12.0)
+    [part], _ = part_of([recording], "searched", 6.0)
     assert isinstance(part, Recording)
     builder = RobotProblemBuilder(THESIS, [part])
-    assert len(builder.motions) == 3 and all(3.9 < m.time[-1] - m.time[0] < 4.1 for m in builder.motions)
+    assert len(builder.motions) == 3 and all(1.9 < m.time[-1] - m.time[0] < 2.1 for m in builder.motions)
     problem = builder.build(with_terms=False)
     assert problem.valid.mean() > 0.5 and np.isfinite(problem.residual).all()
