@@ -38,7 +38,7 @@ def run(folder: Path, package: str, name: str, *arguments: str) -> subprocess.Co
 
 @pytest.mark.parametrize(
     ("package", "name", "module"),
-    [
+    [  # every day all nodes, and a third of the rest, which take as long to import
         pytest.param(*entry, marks=() if entry in NODES or k % 3 == 0 else pytest.mark.nightly)
         for k, entry in enumerate(EXECUTABLES)
     ],

@@ -80,6 +80,16 @@ def test_every_one_of_several_gives_its_share() -> None:
     assert "900 s" in told and "180 s were held out" in told
 
 
+def test_none_of_them_is_left_without_readings() -> None:
+    """One that stands beside a long one, and each of more than there are stretches."""
+    moves, stands = part_of([readings(300.0, np.ones_like), readings(100.0, np.zeros_like)], "searched", 100.0)[0]
+    assert 0.02 * len(moves.joint_states.stamp) == pytest.approx(100.0, abs=1.0)
+    assert 0.02 * len(stands.joint_states.stamp) == pytest.approx(STRETCH, abs=0.1)
+    parts, told = part_of([readings(60.0, np.ones_like) for _ in range(8)], "searched", 100.0)
+    assert all(0.02 * len(part.joint_states.stamp) == pytest.approx(STRETCH, abs=0.1) for part in parts)
+    assert "160 s were searched: 8 stretches" in told
+
+
 def test_a_problem_is_made_of_the_stretches_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between them nothing is filled: each is a piece of its own."""
     monkeypatch.setattr("pcw_sim_bridge.mismatch.long_recordings.STRETCH", 2.0)

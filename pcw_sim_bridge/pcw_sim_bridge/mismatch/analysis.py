@@ -100,9 +100,9 @@ def analyse(
     """
     begun = time.monotonic()
     progress(f"reading {len(fit) + len(holdout)} recording(s)")
-    opened, left_out = subject.part_of([subject.open(path, "fit", topics) for path in fit], "searched")
-    held_out, unproved = subject.part_of([subject.open(path, "holdout", topics) for path in holdout], "held out")
-    lengths = tuple(told for told in (left_out, unproved) if told)
+    opened, of_fit = subject.part_of([subject.open(path, "fit", topics) for path in fit], "searched")
+    held_out, of_holdout = subject.part_of([subject.open(path, "holdout", topics) for path in holdout], "held out")
+    lengths = tuple(told for told in (of_fit, of_holdout) if told)
     for told in lengths:
         progress(told)
     once = "; its model is compiled first, once after an installation" if subject.awaits_compiling() else ""

@@ -33,7 +33,7 @@ def part_of(recordings: Sequence[Recording], use: str, longest: float = LONGEST)
     Args:
         recordings: of one robot; short ones are returned as they are.
         use: what is done with them, in a word for that sentence.
-        longest: of all together [s].
+        longest: of all together [s]; more only where there are so many that a stretch of each is more.
 
     Returns:
         The recordings, from which readings of joints, IMU and tracker and commands between the stretches are gone; and a
@@ -43,18 +43,20 @@ def part_of(recordings: Sequence[Recording], use: str, longest: float = LONGEST)
     if total <= longest:
         return list(recordings), ""
     starts = [np.arange(0.0, max(_length(recording), STRETCH) - 0.5 * STRETCH, STRETCH) for recording in recordings]
-    motion = np.concatenate([_motion(recording, own) for recording, own in zip(recordings, starts, strict=True)])
+    motions = [_motion(recording, own) for recording, own in zip(recordings, starts, strict=True)]
+    motion = np.concatenate(motions)
     count = max(1, int(longest / STRETCH))
     lively = np.flatnonzero(motion >= MOVING * motion.max())
     among = lively if len(lively) >= count else np.sort(np.argsort(-motion, kind="stable")[:count])
     taken = among[np.unique(np.linspace(0, len(among) - 1, count).round().astype(int))]
-    parts, first = [], 0
-    for recording, own in zip(recordings, starts, strict=True):
-        mine = own[taken[(taken >= first) & (taken < first + len(own))] - first]
-        parts.append(_within(recording, mine))
-        first += len(own)
+    parts, first, stretches = [], 0, 0
+    for recording, own, moving in zip(recordings, starts, motions, strict=True):
+        mine = taken[(taken >= first) & (taken < first + len(own))] - first
+        mine = mine if len(mine) else np.array([np.argmax(moving)])  # a recording without readings is none
+        parts.append(_within(recording, own[mine]))
+        first, stretches = first + len(own), stretches + len(mine)
     return parts, (
-        f"Of {total:.0f} s of recordings {len(taken) * STRETCH:.0f} s were {use}: {len(taken)} stretches of {STRETCH:g} s in "
+        f"Of {total:.0f} s of recordings {stretches * STRETCH:.0f} s were {use}: {stretches} stretches of {STRETCH:g} s in "
         "which the robot moves, from all over them. What happens only between them is not seen: give that part alone."
     )
 
