@@ -14,6 +14,7 @@ from pcw_sim_bridge.mismatch.command_findings import command_findings, with_riva
 from pcw_sim_bridge.mismatch.command_tracking import command_problems
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.torque_steps import coarse_reports, coarse_step
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.plants.factory import make_plant
 
@@ -81,6 +82,20 @@ def test_a_dead_time_of_many_cycles_is_as_long_as_it_is():
     assert (instance.name, instance.target, instance.axis) == ("actuator_delay", robot.caster_names, "steer")
     estimate = named.estimates["delay"]
     assert estimate.low < 0.01116 < estimate.high and estimate.value == pytest.approx(0.01116, rel=0.02)
+
+
+@pytest.mark.parametrize("searched", [True, False])
+def test_a_proof_needs_no_numbers_to_try(searched):
+    """Those for the held-out joints were half of the work of this search."""
+    effect = EffectInstance("actuator_delay", ROBOT.caster_names, {"delay": 0.011}, "steer")
+    runs = [simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 10.0, seed), [effect]) for seed in (3, 4)]
+    others = command_problems(ROBOT, runs[1:], searched)
+    assert all(len(term.shapes) > 1 if searched else not term.shapes for problem in others for term in problem.terms)
+    findings = command_findings(command_problems(ROBOT, runs[:1]), others, 0, None, lambda message: None)
+    proofs = {proof.name: proof for proof in findings.proofs}
+    for name in ROBOT.caster_names:
+        proof = proofs[f"command_tracking/{name}_steer"]
+        assert proof.after < 1.1 * proof.floor < 0.5 * proof.before
 
 
 @pytest.mark.parametrize(("part_of_a_delay", "doubted"), [(90.0, True), (-2.0, True), (-20.0, False)])
@@ -204,3 +219,28 @@ def test_where_speeds_are_commanded_the_report_says_what_nobody_sees(controller,
     recording = simulate(World(ROBOT, ROBOT, "reduced", controller), Run("run", "identification", 12.0, 3), ())
     absent = dict(RobotSubject(ROBOT).absent([SimpleNamespace(recording=recording)]))
     assert ("effort in joint_commands" in absent) == told
+
+
+@pytest.mark.parametrize(("step", "coarse"), [(0.05, True), (0.5, True), (2.0, True), (1e-3, False), (0.0, False)])
+def test_torques_in_steps_as_large_as_themselves_are_no_evidence(step, coarse):
+    """Of drives that were asked for less than such a step nearly all reports were zero: a saturation at 3 mN m, p = 1."""
+    torque = 0.17 * np.sin(np.linspace(0.0, 30.0, 2000))
+    reported = np.round(torque / step) * step if step else torque
+    assert (coarse_step(reported) > 0.0) == (coarse and np.any(reported != 0.0))
+    assert coarse_step(np.where(np.arange(2000) % 7, reported, np.nan)) == pytest.approx(coarse_step(reported))
+
+
+def test_joints_with_such_reports_are_left_out_and_told_of():
+    """Their commands and torques say nothing of a motor."""
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 10.0, 3), [])
+    assert coarse_reports(ROBOT, recording) == []
+    effort = recording.joint_states.effort.copy()
+    step = float(np.abs(effort[:, 0, 0]).max())
+    effort[:, 0, 0] = np.round(effort[:, 0, 0] / step) * step
+    joints = dataclasses.replace(recording.joint_states, effort=effort)
+    recording = dataclasses.replace(recording, joint_states=joints)
+    names = {problem.channels[0].name for problem in command_problems(ROBOT, [recording])}
+    left_out = f"{ROBOT.caster_names[0]}_drive"
+    assert len(names) == 2 * ROBOT.n - 1 and f"command_tracking/{left_out}" not in names
+    [told] = coarse_reports(ROBOT, recording)
+    assert left_out in told and "never reached 4" in told

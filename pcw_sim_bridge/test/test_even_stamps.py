@@ -1,11 +1,13 @@
 """Readings at even times with stamps that tremble, and readings that came when their stamps say."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pcw_description import load_robot
+from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.even_stamps import EvenStamps
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
@@ -96,16 +98,41 @@ def test_a_driver_that_begins_to_stamp_what_it_reads_is_believed() -> None:
     assert found is stamp
 
 
-def test_a_recording_is_opened_so_and_commands_keep_the_stamps_of_their_states(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("states", "commands_kept"), [(1, 1), (2, 1), (1, 2)])
+def test_a_recording_is_opened_so_and_commands_keep_the_stamps_of_their_states(
+    states: int, commands_kept: int, tmp_path: Path
+) -> None:
+    """With every second state left out the commands kept stamps that no state had any more: a lag and a delay were found."""
     robot = load_robot("thesis")
 
     def twist(time: float) -> np.ndarray:
         return min(time, 1.0) * np.array([0.4 * np.cos(time), 0.3 * np.sin(1.3 * time), 0.5 * np.sin(0.9 * time)])
 
     record_run(robot, twist, 8.0, 1, tmp_path / "run", "reduced", stamping=StampingParameters(stamp_jitter=JITTER, loss=1e-3))
-    recording = RobotSubject(robot).open(tmp_path / "run", "recording", {}).recording
-    joints, commands = recording.joint_states, recording.joint_commands
-    steps = np.diff(joints.stamp) / STEP
+    read = Recording.open(tmp_path / "run", robot)
+    read.joint_states = every(read.joint_states, states)
+    read.joint_commands = every(read.joint_commands, commands_kept)
+    moved = EvenStamps().evenly_stamped(read)
+    joints, commands = moved.joint_states, moved.joint_commands
+    steps = np.diff(joints.stamp) / (states * STEP)
     assert np.abs(steps - np.round(steps)).max() < 0.01
-    assert np.mean(np.isin(commands.stamp, joints.stamp)) > 0.99
+    fewer, more = sorted((joints.stamp, commands.stamp), key=len)
+    assert np.mean(np.isin(fewer, more)) > 0.98
     assert np.all(np.diff(commands.stamp) >= 0.0)
+
+
+def every(series, step: int):  # type: ignore[no-untyped-def]
+    """Every so many of the messages of a topic."""
+    columns = {f.name: getattr(series, f.name) for f in dataclasses.fields(series)}
+    return dataclasses.replace(series, **{k: v[::step] for k, v in columns.items() if isinstance(v, np.ndarray)})
+
+
+def test_a_subject_opens_recordings_so(tmp_path: Path) -> None:
+    robot = load_robot("thesis")
+
+    def twist(time: float) -> np.ndarray:
+        return min(time, 1.0) * np.array([0.4, 0.0, 0.2 * np.sin(time)])
+
+    record_run(robot, twist, 4.0, 1, tmp_path / "run", "reduced", stamping=StampingParameters(stamp_jitter=JITTER))
+    joints = RobotSubject(robot).open(tmp_path / "run", "recording", {}).recording.joint_states
+    assert np.abs(np.diff(joints.stamp) - STEP).max() < 0.01 * STEP

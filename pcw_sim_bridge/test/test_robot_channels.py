@@ -76,6 +76,26 @@ def column_fit(builder: RobotProblemBuilder, column: np.ndarray) -> tuple[float,
     return coefficient, float(1.0 - np.sum(left**2) / np.sum(target**2))
 
 
+def test_the_candidates_of_some_keys_are_those_of_the_whole_problem(healthy: Recording) -> None:
+    """What nothing was found of has no part in a proof, and its candidates are not made for it."""
+    whole, builder = RobotProblemBuilder(THESIS, [healthy]).build(), RobotProblemBuilder(THESIS, [healthy])
+    assert builder.build(keys=()).terms == ()
+    wanted = ["drive_coulomb_friction/front_left", "payload_mass/chassis", "steer_zero_offset/front_left"]
+    some = builder.build(keys=[*wanted, "payload_mass/nowhere"])
+    places = {term.key: index for index, term in enumerate(whole.terms)}
+    assert sorted(term.key for term in some.terms) == sorted(wanted)
+    np.testing.assert_array_equal(some.residual, whole.residual)
+    for index, term in enumerate(some.terms):
+        place, shape = places[term.key], tuple(sorted(term.shapes[0].items()))
+        np.testing.assert_array_equal(some.columns(index, shape), whole.columns(place, shape))
+        sizes = [
+            SizedTerm(k, shape, np.full(len(term.parameters), 0.01), term.base_indices())
+            for k in (index, place)
+        ]
+        exact, other = some.exact_at({}, sizes[:1]), whole.exact_at({}, sizes[1:])
+        np.testing.assert_array_equal(exact.residual, other.residual)
+
+
 def test_zeros_as_numbers_and_as_effects_are_one_thing_also_where_nothing_tracks_the_robot(tmp_path: Path) -> None:
     """On a slope forces depend on the yaw that the wheels tell, and that on the zeros of their headings."""
     slope = read_physics([{"name": "ground_slope", "angle": 0.03, "direction": 0.4}], THESIS.caster_names)

@@ -125,7 +125,7 @@ def analyse(
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
 
     def needs_no_explanation() -> tuple[CommandFindings, Prover]:
-        fitted, others = subject.command_problems(opened), subject.command_problems(held_out)
+        fitted, others = subject.command_problems(opened), subject.command_problems(held_out, searched=False)
         prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
         return command_findings(fitted, others, seed, settings, progress), prover
 
@@ -151,6 +151,9 @@ def analyse(
         (False, False): "no_mismatch",
     }[bool(instances), bool(leftovers)]
     path = walked(problem, [subject.path(o) for o in opened])
+    # A law outside the library is a term of a later problem than the one it was looked for in.
+    found = [problem.terms[i.term] for i in explanation.fit.instances if i.term < len(problem.terms)]
+    arguments = [name for term in found for name in term.arguments]
     # The prediction belongs to the residual that is exact where the patch is, not to that of the description.
     other = None if prover.other is None else proof.held_out.problem
     findings = Findings(
@@ -169,8 +172,8 @@ def analyse(
         fit=with_channels(proof.finding, commands.proofs),
         ladder=(*_ladder(explanation.selection.ladder), *proof.dropped, *commands.ladder),
         traces=(
-            *_traces(problem, predicted(problem, explanation.fit), explanation.fit, "fit"),
-            *(_traces(other, proof.predicted, explanation.fit, "holdout") if other is not None else ()),
+            *_traces(problem, predicted(problem, explanation.fit), arguments, "fit"),
+            *(_traces(other, proof.predicted, arguments, "holdout") if other is not None else ()),
         ),
         notes=(*lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes),
         seconds=time.monotonic() - begun,
@@ -313,12 +316,9 @@ def _ladder(steps: Sequence[LadderStep]) -> tuple[LadderFinding, ...]:
     return tuple(LadderFinding(s.description, s.gain, s.held_out_gain, s.outcome) for s in steps)
 
 
-def _traces(problem: RegressionProblem, explained: FloatArray, fit: Fit, role: str) -> tuple[Trace, ...]:
-    """One trace per channel, over all recordings on end, against the variable that tells most."""
-    # A law outside the library is a term of the fitted problem alone.
-    terms = [problem.terms[i.term] for i in fit.instances if i.term < len(problem.terms)]
-    instance_arguments = [name for term in terms for name in term.arguments]
-    wanted = [name for name in (*instance_arguments, "velocity", "speed", "time") if name in problem.variables]
+def _traces(problem: RegressionProblem, explained: FloatArray, arguments: Sequence[str], role: str) -> tuple[Trace, ...]:
+    """One trace per channel, over all recordings on end, against the first argument of what was found or else the motion."""
+    wanted = [name for name in (*arguments, "velocity", "speed", "time") if name in problem.variables]
     variable = wanted[0] if wanted else next(iter(problem.variables))
     time_on_end = _on_end(problem)
     traces = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,12 @@ class AxisSubject:
         self._cutoff = builder.cutoff
         return builder.build(self._smoothing)
 
-    def command_problems(self, opened: Sequence[Opened]) -> Sequence[RegressionProblem]:
+    def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
+        """Return what returns the problem: all candidates of one channel are made in no time."""
+        problem = self.problem(opened)
+        return lambda keys: problem
+
+    def command_problems(self, opened: Sequence[Opened], searched: bool = True) -> Sequence[RegressionProblem]:
         """Return nothing: what a bench records is the force itself."""
         return ()
 

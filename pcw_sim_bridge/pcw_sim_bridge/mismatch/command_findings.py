@@ -262,9 +262,12 @@ def _predicted(fitted: RegressionProblem, problem: RegressionProblem, explanatio
     total += problem.nuisance_columns() @ fit.mean[: len(problem.nuisances)]
     position = len(fitted.nuisances)
     for instance in fit.instances:
-        if instance.term < len(problem.terms):
-            columns = problem.terms[instance.term].columns(dict(instance.shape))[..., list(instance.active)]
-            total += columns @ fit.mean[position : position + len(instance.active)]
+        # A law outside the library is a term of the fitted problem alone.
+        key = fitted.terms[instance.term].key if instance.term < len(fitted.terms) else ""
+        for term in problem.terms:
+            if term.key == key:
+                columns = term.columns(dict(instance.shape))[..., list(instance.active)]
+                total += columns @ fit.mean[position : position + len(instance.active)]
         position += len(instance.active)
     return total
 

@@ -35,6 +35,7 @@ from .regression_problem import (
     Shape,
     Term,
 )
+from .torque_steps import coarse_step
 
 LARGEST_STEP = 1e-3  # [s] of the kernels
 SHORTEST = 1.0  # [s]
@@ -110,7 +111,10 @@ def through(effect: ActuatorEffect, values: Mapping[str, float], joint: Commande
 def commanded_joints(
     robot: RobotDescription, recordings: Sequence[Recording]
 ) -> dict[tuple[int, int], list[CommandedJoint]]:
-    """Return the pieces of every joint (caster, axis) that has torque commands and reported torques in all recordings."""
+    """Return the pieces of every joint (caster, axis) that has torque commands and reported torques in all recordings.
+
+    Without those that were reported in steps as large as themselves.
+    """
     found: dict[tuple[int, int], list[CommandedJoint]] = {}
     for index, recording in enumerate(recordings):
         commands, joints = held_commands(robot, recording), recording.joint_states
@@ -118,6 +122,8 @@ def commanded_joints(
             return {}
         for i in range(robot.n):
             for axis in range(2):
+                if coarse_step(joints.effort[:, i, axis]) > 0.0:
+                    continue
                 command = commands[:, i, axis]
                 usable = np.isfinite(command) & np.isfinite(joints.effort[:, i, axis])
                 for piece in _pieces(joints.stamp, np.asarray(usable)):
@@ -143,10 +149,17 @@ def _pieces(stamp: FloatArray, usable: BoolArray) -> list[slice]:
     return found
 
 
-def command_problems(robot: RobotDescription, recordings: Sequence[Recording]) -> list[RegressionProblem]:
-    """Return one problem per joint with commands, in the order of the joints."""
+def command_problems(
+    robot: RobotDescription, recordings: Sequence[Recording], searched: bool = True
+) -> list[RegressionProblem]:
+    """Return one problem per joint with commands, in the order of the joints.
+
+    Args:
+        robot: the nominal robot; recordings: opened with it.
+        searched: False: the candidates get no numbers to try.
+    """
     pieces = commanded_joints(robot, recordings)
-    return [_JointProblem(robot, i, axis, own).problem() for (i, axis), own in sorted(pieces.items())]
+    return [_JointProblem(robot, i, axis, own).problem(searched) for (i, axis), own in sorted(pieces.items())]
 
 
 class _JointProblem:
@@ -177,8 +190,8 @@ class _JointProblem:
             found.append(torque)
         return np.concatenate(found)
 
-    def problem(self) -> RegressionProblem:
-        """Return the regression problem."""
+    def problem(self, searched: bool) -> RegressionProblem:
+        """Return the regression problem, see `command_problems`."""
         lengths = [len(piece.time) for piece in self.pieces]
         return RegressionProblem(
             channels=(Channel(f"command_tracking/{self.caster}_{self.axis}", "N m", (self.caster,), self.axis),),
@@ -190,7 +203,7 @@ class _JointProblem:
             residual=(self._measured - self._plain)[:, None],
             valid=np.ones((len(self._measured), 1), dtype=bool),
             nuisances=tuple(self._nuisances()),
-            terms=tuple(self._terms()),
+            terms=tuple(self._terms(searched)),
             variables=self._variables(),
         )
 
@@ -209,13 +222,13 @@ class _JointProblem:
         instance = EffectInstance(effect.name, (self.caster,), dict(shape), self.axis)
         return (self._torques([instance]) - self._plain)[:, None, None]
 
-    def _terms(self) -> list[Term]:
+    def _terms(self, searched: bool) -> list[Term]:
         found = []
         for effect in all_effects().values():
             if not isinstance(effect, ActuatorEffect) or self.axis not in (effect.axes or (effect.axis,)):
                 continue
-            shapes, resolution, among = self._grid(effect)
-            if shapes:
+            shapes, resolution, among = self._grid(effect) if searched else ((), {}, 0)
+            if shapes or not searched:
                 found.append(
                     Term(
                         effect=effect.name, target=(self.caster,), parameters=(PRESENCE,), shapes=shapes,

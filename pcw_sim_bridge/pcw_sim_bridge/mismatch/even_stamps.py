@@ -31,6 +31,7 @@ SLOW = 2.0  # [s]; over which clocks that drift are followed
 MOTION = 0.05  # [s]; over which speeds are averaged
 SURE = 0.2  # largest deviation of beta that decides
 LEAST_READINGS = 200
+ANSWERED = 0.5  # of the stamps that commands share with the states that they answer
 KEPT = 0.9  # of what earlier recordings of the same robot said; a driver may have been changed
 
 
@@ -54,7 +55,10 @@ class EvenStamps:
         if stamp is not joints.stamp:
             moved.joint_states = dataclasses.replace(joints, stamp=stamp)
             commands = recording.joint_commands
-            if commands is not None and np.isin(commands.stamp, joints.stamp).sum() > 0.5 * len(commands.stamp):
+            # Either of the two may be recorded less often than the other.
+            if commands is not None and np.isin(commands.stamp, joints.stamp).sum() > ANSWERED * min(
+                len(commands.stamp), len(joints.stamp)
+            ):
                 nearest = np.clip(np.searchsorted(joints.stamp, commands.stamp), 0, len(stamp) - 1)
                 later = np.interp(commands.stamp, joints.stamp, stamp - joints.stamp)
                 answered = np.where(joints.stamp[nearest] == commands.stamp, stamp[nearest], commands.stamp + later)

@@ -124,7 +124,10 @@ class Prover:
         """
         self.besides = False
         self.subject, self.retune, self.reduce, self.rng = subject, retune, reduce, rng
-        self.other = subject.problem(held_out) if held_out else None
+        self._problem_with = subject.problem_with(held_out) if held_out else None
+        # Candidates that nothing is found of would be most of the work.
+        self._made: set[str] = set()
+        self.other = self._problem_with(self._made) if self._problem_with else None
         self.unusable = self.other is not None and self.other.valid.any(axis=1).sum() < LEAST_DURATION * self.other.rate
         if self.unusable:
             self.other, held_out = None, ()
@@ -273,6 +276,9 @@ class Prover:
         modelled = {*(entry.instance for entry in explanation.named), *self.laws.laws}
         instances = selection.fit.instances
         if self.other is not None:
+            if self._problem_with is not None and not (keys := _keys(explanation)) <= self._made:
+                self._made |= keys
+                self.other = self._problem_with(self._made)
             other = self.laws.in_problem(self.other)
             names = [[c.name for c in p.channels] for p in (problem, other)]
             if names[0] != names[1]:
@@ -581,6 +587,15 @@ def _predicted_without(held_out: HeldOut, left_out: Collection[str]) -> FloatArr
     stays = [number.name in left_out for number in held_out.problem.nuisances]
     means[:, : held_out.nuisances][:, stays] = 0.0
     return held_out.predicted(means)
+
+
+def _keys(explanation: Explanation) -> set[str]:
+    """Keys of all terms that an explanation holds, or is exact with."""
+    problem = explanation.search.problem
+    held = {instance.term for instance in explanation.selection.fit.instances} | set(problem.near)
+    if problem.point is not None:
+        held |= {size.term for size in problem.point.sizes}
+    return {problem.terms[index].key for index in held if index < len(problem.terms)}
 
 
 def _names(explanation: Explanation) -> frozenset[str]:

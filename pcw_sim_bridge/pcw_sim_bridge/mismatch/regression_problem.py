@@ -200,14 +200,21 @@ class Term:
     @property
     def key(self) -> str:
         """Short label for logs and tables."""
-        place = f"{self.axis} of " if self.axis else ""
-        occasion = "" if self.recording is None else f" in recording {self.recording + 1}"
-        law = f" by {', '.join(self.arguments)}" if self.effect == UNKNOWN else ""
-        return f"{self.effect}/{place}{'+'.join(self.target)}{law}{occasion}"
+        return term_key(self.effect, self.target, self.axis, self.recording, self.arguments)
 
     def base_indices(self) -> tuple[int, ...]:
         """Positions of the parameters that are not refinements."""
         return tuple(i for i, parameter in enumerate(self.parameters) if not parameter.refinement)
+
+
+def term_key(
+    effect: str, target: Sequence[str], axis: str | None = None, recording: int | None = None, arguments: Sequence[str] = ()
+) -> str:
+    """Return the key of the term of an effect; `arguments` tell one unknown law from another."""
+    place = f"{axis} of " if axis else ""
+    occasion = "" if recording is None else f" in recording {recording + 1}"
+    law = f" by {', '.join(arguments)}" if effect == UNKNOWN else ""
+    return f"{effect}/{place}{'+'.join(target)}{law}{occasion}"
 
 
 @dataclasses.dataclass(frozen=True)

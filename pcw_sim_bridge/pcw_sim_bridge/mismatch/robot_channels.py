@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -27,7 +27,16 @@ from .clock_leads import clock_leads
 from .errors import MismatchError
 from .first_look import Looked, remainder
 from .found_effect import effect_instance
-from .regression_problem import BoolArray, Channel, FloatArray, RegressionProblem, Sites, SizedTerm, Term
+from .regression_problem import (
+    BoolArray,
+    Channel,
+    FloatArray,
+    Nuisance,
+    RegressionProblem,
+    Sites,
+    SizedTerm,
+    Term,
+)
 from .robot_effects import ChannelModel, true_motion, with_leads, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, has_balance, read_motions
 from .robot_nuisances import (
@@ -42,7 +51,7 @@ from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
 from .signal_filter import SignalFilter
 from .sudden_slip import sudden_slip
-from .torque_errors import with_balanced_torques
+from .torque_errors import INSTRUMENTS, with_balanced_torques
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
 SLIP_FLOOR, SLIP_PART = 0.03, 0.75
@@ -63,6 +72,8 @@ DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_latera
 TANGENT_STEP = 0.01
 # The effect that says by how much the stamps of IMU and tracker are ahead, and its numbers in that order.
 CLOCKS, CLOCK_NUMBERS = "clock_offset", ("offset", "tracker_offset")
+# Channels and what they differ by, which samples of them may be judged, and the numbers that a healthy robot may differ in.
+Prepared = tuple[ChannelDifferences, BoolArray, tuple[Nuisance, ...]]
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 
 
@@ -113,23 +124,14 @@ class RobotProblemBuilder:
         """Channels that these recordings can fill."""
         return self.layout.channels()
 
-    def build(self, with_terms: bool = True) -> RegressionProblem:
+    def build(self, with_terms: bool = True, keys: Collection[str] | None = None) -> RegressionProblem:
         """Return the regression problem of all recordings.
 
         Args:
             with_terms: False leaves out candidate effects: residual and tolerances alone are many times cheaper.
+            keys: of the candidates that are wanted; None: all.
         """
-        if with_terms:
-            self._leads = clock_leads(self.motions, self.numbers)
-        if self._leads.any():
-            self.motions = self._motions_of(self.model, leads=self._leads)
-        differences = ChannelDifferences(self.model, self.motions, self.filters)
-        valid, nuisances = self._valid(differences), tuple(robot_nuisances(self.robot, differences))
-        if with_terms and self.layout.balanced:
-            self._read = with_balanced_torques(self._read, differences, valid, nuisances)
-            self.motions = self._motions_of(self.model, leads=self._leads)
-            differences = ChannelDifferences(self.model, self.motions, self.filters)
-            nuisances = tuple(robot_nuisances(self.robot, differences))
+        differences, valid, nuisances = self._prepared if with_terms else self._as_read()
         along = self._along_motions(differences)
         stamps = [f.decimate(m.time) for f, m in zip(self.filters, self.motions, strict=True)]
         time = np.concatenate(stamps)
@@ -142,7 +144,7 @@ class RobotProblemBuilder:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
             looked = Looked(left, deviation, valid, time, recording, rate, angle, places, headings)
-            terms = tuple(robot_terms(self.robot, differences, looked, bool(self._leads.any())))
+            terms = tuple(robot_terms(self.robot, differences, looked, bool(self._leads.any()), keys))
         exact = functools.partial(self._exact, differences, terms)
         residual, nominal = differences.residual, None
         if self._leads.any() and (found := exact({}, ())):
@@ -170,6 +172,24 @@ class RobotProblemBuilder:
             softened=self._softened if self.layout.balanced else None,
             remarks=self._remarks(),
         )
+
+    @functools.cached_property
+    def _prepared(self) -> Prepared:
+        """What candidates are made from: with clocks and torques put right that would be taken for something else."""
+        self._leads = clock_leads(self.motions, self.numbers)
+        if self._leads.any():
+            self.motions = self._motions_of(self.model, leads=self._leads)
+        if self.layout.balanced:
+            differences = ChannelDifferences(self.model, self.motions, self.filters)
+            instruments = robot_nuisances(self.robot, differences, INSTRUMENTS)
+            self._read = with_balanced_torques(self._read, differences, self._valid(differences), instruments)
+            self.motions = self._motions_of(self.model, leads=self._leads)
+        return self._as_read()
+
+    def _as_read(self) -> Prepared:
+        """The same of the motions as they are."""
+        differences = ChannelDifferences(self.model, self.motions, self.filters)
+        return differences, self._valid(differences), tuple(robot_nuisances(self.robot, differences))
 
     def _exact(
         self, differences: ChannelDifferences, terms: Sequence[Term], changes: Mapping[str, float], sizes: Sequence[SizedTerm]

@@ -51,9 +51,16 @@ class VariedNumber:
         return self.nominal / FARTHEST - self.nominal, self.nominal * FARTHEST - self.nominal
 
 
-def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) -> list[Nuisance]:
-    """Return every number that has a tolerance and shows in the channels, and the lean of the floor."""
-    varied = varied_numbers(robot, differences)
+def robot_nuisances(
+    robot: RobotDescription, differences: ChannelDifferences, kinds: tuple[str, ...] = ("",)
+) -> list[Nuisance]:
+    """Return every number that has a tolerance and shows in the channels, and the lean of the floor.
+
+    Args:
+        robot: the nominal robot; differences: its channels.
+        kinds: how the names of those begin that are wanted.
+    """
+    varied = [number for number in varied_numbers(robot, differences) if number.label.startswith(kinds)]
     columns = on_all_cores(lambda n: differences.of_numbers(n.vary, 0.5 * n.deviation), varied)
     found = [
         Nuisance(
@@ -62,7 +69,7 @@ def robot_nuisances(robot: RobotDescription, differences: ChannelDifferences) ->
         )
         for n, column in zip(varied, columns, strict=True)
     ]
-    return found + floor_nuisances(robot, differences)
+    return found + [number for number in floor_nuisances(robot, differences) if number.name.startswith(kinds)]
 
 
 def _misjudged(number: VariedNumber, column: FloatArray, differences: ChannelDifferences) -> float:

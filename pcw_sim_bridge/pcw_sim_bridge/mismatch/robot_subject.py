@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_sq
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
 from .subject import Opened
+from .torque_steps import coarse_reports
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
@@ -82,6 +83,7 @@ class RobotSubject:
                 f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
                 "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
             )
+        warnings += coarse_reports(self._seen_robot(), recording)
         started = recording.t0_ns * 1e-9
         finding = InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings), started)
         return Opened(recording, finding)
@@ -128,18 +130,26 @@ class RobotSubject:
 
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem."""
+        return self._builder(opened).build()
+
+    def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
+        """Return what makes it of the candidates of some keys alone."""
+        builder = self._builder(opened)
+        return lambda keys: builder.build(keys=keys)
+
+    def _builder(self, opened: Sequence[Opened]) -> RobotProblemBuilder:
         recordings, robot = [o.recording for o in opened], self._seen_robot()
         if self._cutoff is None:
             self._cutoff = choose_cutoff(robot, recordings)
         try:
-            return RobotProblemBuilder(robot, recordings, self._cutoff).build()
+            return RobotProblemBuilder(robot, recordings, self._cutoff)
         except MismatchError as error:
             told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
             raise MismatchError("; ".join((str(error), *told))) from None
 
-    def command_problems(self, opened: Sequence[Opened]) -> Sequence[RegressionProblem]:
+    def command_problems(self, opened: Sequence[Opened], searched: bool = True) -> Sequence[RegressionProblem]:
         """Return one problem per joint whose torque commands and torques were recorded."""
-        return command_problems(self._seen_robot(), [o.recording for o in opened])
+        return command_problems(self._seen_robot(), [o.recording for o in opened], searched)
 
     def unit(self, unit: str) -> str:
         """Return a unit as it is."""

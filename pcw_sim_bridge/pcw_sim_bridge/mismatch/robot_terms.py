@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from .axis_channels import kernel_arguments
 from .channel_differences import ChannelDifferences
 from .composed_columns import Columns, Placed, Turning, frozen
 from .first_look import Chosen, ChosenShapes, Looked, common_orders, orders, patches, waves, windows
-from .regression_problem import FloatArray, LinearParameter, Shape, Term
+from .regression_problem import FloatArray, LinearParameter, Shape, Term, term_key
 from .robot_effects import torque_along
 from .robot_nuisances import FLOOR
 
@@ -53,7 +53,8 @@ _ARGUMENT_NAMES = {"position": "angle", "velocity": "velocity", "force": "torque
 
 
 def robot_terms(
-    robot: RobotDescription, differences: ChannelDifferences, looked: Looked, exact_clocks: bool = False
+    robot: RobotDescription, differences: ChannelDifferences, looked: Looked, exact_clocks: bool = False,
+    keys: Collection[str] | None = None,
 ) -> list[Term]:
     """Return all candidates whose effects show in the channels.
 
@@ -62,8 +63,9 @@ def robot_terms(
         differences: what its channels differ by.
         looked: what a first look needs.
         exact_clocks: the problem's exact residual holds what clocks are off by.
+        keys: of those that are wanted, see `term_key`; None: all.
     """
-    return _TermMaker(robot, differences, looked, exact_clocks).terms()
+    return _TermMaker(robot, differences, looked, exact_clocks).terms(keys)
 
 
 class _TermMaker:
@@ -76,8 +78,8 @@ class _TermMaker:
         self.layout = differences.model.layout
         self._of_joint: dict[tuple[int, int], Chosen] = {}
 
-    def terms(self) -> list[Term]:
-        """All candidates."""
+    def terms(self, keys: Collection[str] | None) -> list[Term]:
+        """The candidates of some keys; None: of all."""
         # Of one caster, each and all are the same.
         everything = list(dict.fromkeys([*((name,) for name in self.robot.caster_names), self.robot.caster_names]))
         wanted: list[tuple[Effect, tuple[str, ...], str | None, int | None]] = []
@@ -96,6 +98,8 @@ class _TermMaker:
                 for target in targets
                 for occasion in occasions
             ]
+        if keys is not None:
+            wanted = [one for one in wanted if term_key(one[0].name, *one[1:]) in keys]
         return [term for term in on_all_cores(lambda one: self._term(*one), wanted) if term is not None]
 
     def _term(self, effect: Effect, target: tuple[str, ...], axis: str | None, recording: int | None) -> Term | None:

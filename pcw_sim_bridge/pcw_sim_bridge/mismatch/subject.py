@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,8 +46,16 @@ class Subject(Protocol):
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem of recordings; later calls keep the filters that the first one chose."""
 
-    def command_problems(self, opened: Sequence[Opened]) -> Sequence[RegressionProblem]:
-        """Return one problem per joint between its commands and its torques; none where nothing was commanded."""
+    def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
+        """Return what makes the same of the candidates of some keys alone, none of which is made before."""
+
+    def command_problems(self, opened: Sequence[Opened], searched: bool = True) -> Sequence[RegressionProblem]:
+        """Return one problem per joint between its commands and its torques; none where nothing was commanded.
+
+        Args:
+            opened: the recordings.
+            searched: False: the candidates get no numbers to try, which is most of the work.
+        """
 
     def unit(self, unit: str) -> str:
         """Return a unit of the vocabulary as it is here (a linear axis has N for N m)."""

@@ -28,7 +28,7 @@ from .regression_problem import BoolArray, FloatArray, Nuisance
 from .robot_motion import RobotMotion
 
 FORCES = slice(0, 3)  # channels of the balance
-INSTRUMENTS = ("chassis.", "module.", "wheel.inertia", "rotors.", "suspension.", "ground.")  # numbers that hold no torque
+INSTRUMENTS = ("chassis.", "module.", "wheel.inertia", "rotors.", "suspension.", "ground.")  # of those without torques
 FRICTION_SPEED = 0.05  # [rad/s], at which dry friction reverses
 RIDGE = 1e-6  # of what a number explains, so that numbers which are the same thing share it
 SLOW = 0.4  # [s]; errors fluctuate faster than robots move, and than most of what depends on how they move
@@ -38,19 +38,19 @@ LEAST_ROWS = 200  # of the balance; fewer tell no errors from masses and frictio
 
 
 def with_balanced_torques(
-    read: Sequence[RobotMotion], differences: ChannelDifferences, valid: BoolArray, nuisances: Sequence[Nuisance]
+    read: Sequence[RobotMotion], differences: ChannelDifferences, valid: BoolArray, instruments: Sequence[Nuisance]
 ) -> list[RobotMotion]:
     """Return motions whose `balanced_torque` fits them.
 
     Args:
         read: the motions as they were read; differences: their channels under the description.
         valid: samples (T, C) that can be judged.
-        nuisances: numbers of the description.
+        instruments: those numbers of the description that are `INSTRUMENTS`.
     """
     usable: BoolArray = valid[:, FORCES].min(axis=1)
     if usable.sum() < LEAST_ROWS:
         return list(read)
-    left = np.where(usable[:, None], _without_instruments(differences, usable, nuisances), 0.0)
+    left = np.where(usable[:, None], _without_instruments(differences, usable, instruments), 0.0)
     maps = differences.wrench_of_torque()
     found, start = [], 0
     for motion, own, of_torque in zip(read, differences.filters, maps, strict=True):
@@ -83,7 +83,7 @@ def _fluctuates(left: FloatArray, usable: BoolArray, rate: float) -> BoolArray:
     return found
 
 
-def _without_instruments(differences: ChannelDifferences, usable: BoolArray, nuisances: Sequence[Nuisance]) -> FloatArray:
+def _without_instruments(differences: ChannelDifferences, usable: BoolArray, instruments: Sequence[Nuisance]) -> FloatArray:
     """What masses and frictions leave of the balance (T, 3), however far they have to go for it."""
     torques = []
     for motion in differences.motions:
@@ -95,7 +95,7 @@ def _without_instruments(differences: ChannelDifferences, usable: BoolArray, nui
                 [np.ones_like(values), values, np.tanh(values / FRICTION_SPEED)], axis=1
             )
         torques.append(columns.reshape(*motion.torque.shape, -1))
-    known = [n.column[:, FORCES, None] for n in nuisances if n.name.startswith(INSTRUMENTS)]
+    known = [n.column[:, FORCES, None] for n in instruments]
     columns = np.concatenate([*known, differences.of_torque(torques)[:, FORCES]], axis=2)
     # The residual holds the torque as it was reported; its errors are sought beyond those that are out of the quiet one.
     known_errors = [(motion.torque - motion.quiet_torque)[..., None] for motion in differences.motions]
