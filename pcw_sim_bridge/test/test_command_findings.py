@@ -13,8 +13,8 @@ from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulat
 from pcw_sim_bridge.mismatch.command_findings import command_findings, with_rivals
 from pcw_sim_bridge.mismatch.command_tracking import command_problems
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
+from pcw_sim_bridge.mismatch.reported_torques import coarse_step, doubtful_reports, told_of, unlikely_factor
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.torque_steps import coarse_reports, coarse_step
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.plants.factory import make_plant
 
@@ -230,17 +230,40 @@ def test_torques_in_steps_as_large_as_themselves_are_no_evidence(step, coarse):
     assert coarse_step(np.where(np.arange(2000) % 7, reported, np.nan)) == pytest.approx(coarse_step(reported))
 
 
+@pytest.mark.parametrize(
+    ("reported", "factor"),
+    [
+        (lambda command: -command, -1.0),
+        (lambda command: 0.05 * command, 0.05),
+        (lambda command: 37.0 * command, 37.0),
+        (lambda command: 0.4 * command, None),  # a motor that is weak
+        (lambda command: np.clip(command, -0.05, 0.05), None),  # or limited
+        (lambda command: np.zeros_like(command), None),  # or off
+        (lambda command: np.roll(command, 300), None),
+    ],
+)
+def test_what_no_motor_makes_of_its_commands_is_told_from_what_one_does(reported, factor):
+    """With the sign of all reports turned about two saturations were named, p = 1."""
+    rng = np.random.default_rng(1)
+    command = 0.2 * np.sin(np.linspace(0.0, 40.0, 3000)) + 0.1 * rng.standard_normal(3000)
+    torque = reported(command) + 0.005 * rng.standard_normal(3000)
+    found = unlikely_factor(command, np.where(rng.random(3000) < 0.1, np.nan, torque))
+    assert found is None if factor is None else found == pytest.approx(factor, rel=0.05)
+    assert unlikely_factor(command[:100], torque[:100]) is None
+
+
 def test_joints_with_such_reports_are_left_out_and_told_of():
     """Their commands and torques say nothing of a motor."""
     recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 10.0, 3), [])
-    assert coarse_reports(ROBOT, recording) == []
+    assert doubtful_reports(ROBOT, recording) == {}
     effort = recording.joint_states.effort.copy()
     step = float(np.abs(effort[:, 0, 0]).max())
     effort[:, 0, 0] = np.round(effort[:, 0, 0] / step) * step
-    joints = dataclasses.replace(recording.joint_states, effort=effort)
-    recording = dataclasses.replace(recording, joint_states=joints)
+    effort[:, 1:3, 0] *= -1.0
+    recording = dataclasses.replace(recording, joint_states=dataclasses.replace(recording.joint_states, effort=effort))
     names = {problem.channels[0].name for problem in command_problems(ROBOT, [recording])}
-    left_out = f"{ROBOT.caster_names[0]}_drive"
-    assert len(names) == 2 * ROBOT.n - 1 and f"command_tracking/{left_out}" not in names
-    [told] = coarse_reports(ROBOT, recording)
-    assert left_out in told and "never reached 4" in told
+    left_out = [f"{name}_drive" for name in ROBOT.caster_names[:3]]
+    assert len(names) == 2 * ROBOT.n - 3 and not names & {f"command_tracking/{name}" for name in left_out}
+    coarse, opposite = told_of(ROBOT, doubtful_reports(ROBOT, recording))
+    assert f"effort of {left_out[0]} comes in steps of {step:.2g} N m and never reached 4" in coarse
+    assert f"effort of {', '.join(left_out[1:])} is opposite to what was commanded" in opposite

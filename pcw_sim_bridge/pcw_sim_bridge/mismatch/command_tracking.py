@@ -35,7 +35,7 @@ from .regression_problem import (
     Shape,
     Term,
 )
-from .torque_steps import coarse_step
+from .reported_torques import doubtful_reports
 
 LARGEST_STEP = 1e-3  # [s] of the kernels
 SHORTEST = 1.0  # [s]
@@ -113,16 +113,17 @@ def commanded_joints(
 ) -> dict[tuple[int, int], list[CommandedJoint]]:
     """Return the pieces of every joint (caster, axis) that has torque commands and reported torques in all recordings.
 
-    Without those that were reported in steps as large as themselves.
+    Without those with which something is wrong, see `doubtful_reports`.
     """
     found: dict[tuple[int, int], list[CommandedJoint]] = {}
     for index, recording in enumerate(recordings):
         commands, joints = held_commands(robot, recording), recording.joint_states
         if commands is None or joints.effort is None:
             return {}
+        doubtful = doubtful_reports(robot, recording)
         for i in range(robot.n):
             for axis in range(2):
-                if coarse_step(joints.effort[:, i, axis]) > 0.0:
+                if (i, axis) in doubtful:
                     continue
                 command = commands[:, i, axis]
                 usable = np.isfinite(command) & np.isfinite(joints.effort[:, i, axis])

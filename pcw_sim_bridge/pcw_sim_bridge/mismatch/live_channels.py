@@ -27,6 +27,7 @@ from pcw_description.robot_description import DRIVE, RobotDescription
 
 from .errors import MismatchError
 from .even_stamps import EvenStamps
+from .joint_glitches import without_glitches
 from .live_rows import LONGEST_WINDOW, NANOSECONDS, RowReader, Rows
 from .live_suspects import Suspect, find_suspect
 from .live_tuning import Tuning, digest
@@ -243,16 +244,16 @@ class LiveChannels:
         if self._learned() < self.parameters.learning:
             return self._nothing(*problems)
         stamps = EvenStamps()
-        recording = stamps.evenly_stamped(Recording.of_messages(self._ring.since(0), self.robot))
+        recording, told = without_glitches(stamps.evenly_stamped(Recording.of_messages(self._ring.since(0), self.robot)))
         builder = RobotProblemBuilder(self.robot, [recording], live=True)
         reader = RowReader(self.robot, builder.cutoff, stamps)
-        window = reader.go_on(recording, builder)
+        window = reader.go_on(recording, builder, told)
         rate = float(np.mean([f.decimated_rate for f in builder.filters]))
         self.tuning = Tuning.learn(digest(self.robot), builder.cutoff, window.layout, window.rows, rate)
         self._reader = reader
         self._moved.clear()
         self._ring = self._ring_for(LONGEST_WINDOW)
-        return self._nothing(*problems)
+        return self._nothing(*problems, *told)
 
     # --- Judging ----------------------------------------------------------------------------------------
 

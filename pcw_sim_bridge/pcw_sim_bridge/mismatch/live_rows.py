@@ -16,6 +16,7 @@ from pcw_description.recording_files import RawMessage
 from pcw_description.robot_description import RobotDescription
 
 from .even_stamps import EvenStamps
+from .joint_glitches import without_glitches
 from .regression_problem import BoolArray, Channel, FloatArray
 from .robot_channels import RobotProblemBuilder
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion
@@ -158,13 +159,13 @@ class RowReader:
         """Return all rows of messages that were read before; raises as `read`."""
         return self._window(*self._opened(messages))
 
-    def _opened(self, messages: Sequence[RawMessage]) -> tuple[Recording, RobotProblemBuilder]:
-        recording = self._stamps.evenly_stamped(Recording.of_messages(messages, self.robot))
-        return recording, RobotProblemBuilder(self.robot, [recording], self.cutoff, live=True)
+    def _opened(self, messages: Sequence[RawMessage]) -> tuple[Recording, RobotProblemBuilder, Sequence[str]]:
+        recording, told = without_glitches(self._stamps.evenly_stamped(Recording.of_messages(messages, self.robot)))
+        return recording, RobotProblemBuilder(self.robot, [recording], self.cutoff, live=True), told
 
-    def go_on(self, recording: Recording, builder: RobotProblemBuilder) -> Window:
-        """Return what is new in a recording whose builder has been made, and go on from there."""
-        window = self._window(recording, builder)
+    def go_on(self, recording: Recording, builder: RobotProblemBuilder, told: Sequence[str] = ()) -> Window:
+        """Return what is new in a recording with its builder, and go on from there; told: what was wrong with it."""
+        window = self._window(recording, builder, told)
         start = recording.t0_ns / NANOSECONDS
         self._yaw = (
             np.concatenate([start + motion.time for motion in builder.motions]),
@@ -176,7 +177,7 @@ class RowReader:
             self._last_row = float(window.rows.time[-1])
         return window
 
-    def _window(self, recording: Recording, builder: RobotProblemBuilder) -> Window:
+    def _window(self, recording: Recording, builder: RobotProblemBuilder, told: Sequence[str]) -> Window:
         start = recording.t0_ns / NANOSECONDS
         builder.motions = [self._aligned(motion, start) for motion in builder.motions]
         problem = builder.build(with_terms=False)
@@ -191,7 +192,7 @@ class RowReader:
             problem.nuisance_deviations(),
             problem.scale_deviation,
         )
-        warnings = tuple(str(warning) for warning in recording.warnings)
+        warnings = (*(str(warning) for warning in recording.warnings), *told)
         return Window(builder, layout, rows, 0.5 / problem.rate, warnings)
 
     def _aligned(self, motion: RobotMotion, start: float) -> RobotMotion:

@@ -31,8 +31,10 @@ from .errors import MismatchError
 from .even_stamps import EvenStamps
 from .findings import InputFinding
 from .found_effect import effect_instance
+from .joint_glitches import without_glitches
 from .long_recordings import part_of
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
+from .reported_torques import doubtful_reports, told_of
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
@@ -40,7 +42,6 @@ from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_sq
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
 from .subject import Opened
-from .torque_steps import coarse_reports
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
@@ -75,15 +76,15 @@ class RobotSubject:
             joints = recording.joint_states
             recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
         self._check_sensors(path, recording)
-        recording = EvenStamps().evenly_stamped(recording)
-        warnings = [f"{warning.topic}: {warning.text}" for warning in found]
+        recording, jumps = without_glitches(EvenStamps().evenly_stamped(recording))
+        warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *jumps]
         apart = _contradiction(self._seen_robot(), recording)
         if apart > CONTRADICTORY:
             warnings.append(
                 f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
                 "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
             )
-        warnings += coarse_reports(self._seen_robot(), recording)
+        warnings += told_of(self._seen_robot(), doubtful_reports(self._seen_robot(), recording))
         started = recording.t0_ns * 1e-9
         finding = InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings), started)
         return Opened(recording, finding)
