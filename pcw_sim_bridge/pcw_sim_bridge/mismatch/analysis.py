@@ -102,6 +102,9 @@ def analyse(
     progress(f"reading {len(fit) + len(holdout)} recording(s)")
     opened, of_fit = subject.part_of([subject.open(path, "fit", topics) for path in fit], "searched")
     held_out, of_holdout = subject.part_of([subject.open(path, "holdout", topics) for path in holdout], "held out")
+    for one in (*opened, *held_out):
+        for warning in one.finding.warnings:
+            progress(f"{one.finding.path}: {warning}")
     lengths = tuple(told for told in (of_fit, of_holdout) if told)
     for told in lengths:
         progress(told)

@@ -18,7 +18,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, optimize
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
@@ -39,6 +39,9 @@ SMALLEST_SHARE = 0.10
 SMALLEST_PART = 0.02
 # So many deviations of what the model misjudges are more than that.
 BEYOND_DOUBT = 2.0
+# Tolerances by which no number is off in a robot that is this one: a gyro that turns the other way is not one whose scale is
+# 400 tolerances off, and what is left of it is not noise.
+FARTHEST = 10.0
 # No wheel is rounder, and no floor is more even, than that what it rolls is known better than to this part of its way.
 ROUNDNESS = 2e-4
 LARGEST_LAWS = 2
@@ -631,8 +634,17 @@ class AugmentedFit:
         return np.stack([self._posterior(total - gram, len(self.deviations)) for gram in self._grams])
 
     def _posterior(self, gram: FloatArray, count: int) -> FloatArray:
+        """The first numbers (count,), none of the description's so far off that it would not be re-tuning any more."""
         precision = gram[:count, :count] + np.diag(1.0 / self.deviations[:count] ** 2)
-        return np.asarray(np.linalg.solve(precision, gram[:count, -1]), dtype=np.float64)
+        mean = np.asarray(np.linalg.solve(precision, gram[:count, -1]), dtype=np.float64)
+        limits = np.full(count, np.inf)
+        numbers = self.regression.problem.nuisances
+        limits[: len(numbers)] = [np.inf if number.loose else FARTHEST * number.deviation for number in numbers]
+        if np.all(np.abs(mean) <= limits):
+            return mean
+        root = np.linalg.cholesky(precision)
+        bounded = optimize.lsq_linear(root.T, np.linalg.solve(root, gram[:count, -1]), (-limits, limits))
+        return np.asarray(bounded.x, dtype=np.float64)
 
     def held_out_errors(self) -> tuple[float, float]:
         """Squared whitened error on held-out blocks without and with the function."""

@@ -41,6 +41,7 @@ LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 ALLOWED_HARM = 0.01
 # Part of what no name explained from which a law is told of though other data contradict it.
 MOST_OF_IT = 0.5
+FAR_FROM_FLOOR = 4.0  # of a healthy robot's channels none leaves twice its floor
 # Kinds of numbers that move a simulated robot, by how their names begin. One kind may lead it astray, and foretell its own
 # channels well: what is wrong with the forces of tyres and bodies is put into masses.
 KINDS = (
@@ -191,9 +192,11 @@ class Prover:
                 )
         # A small part of what was left, which forces and slips of other data contradict, is a detail of what was fitted; most
         # of it was there. A simulation that goes astray says less: the law may be the wrong one for something that is there.
+        # Where none of it can stand, what is left is far more than noise, and is told of whatever it depends on.
+        far = bool(contradicted) and _times_floor(explanation, refused) > FAR_FROM_FLOOR
         left = tuple(
             found for found in explanation.leftovers
-            if found.share >= MOST_OF_IT or not any(found.law is law for law in contradicted)
+            if far or found.share >= MOST_OF_IT or not any(found.law is law for law in contradicted)
         )
         explanation = dataclasses.replace(explanation, leftovers=left)
         notes += self._remarks(explanation, held_out, after)
@@ -564,6 +567,15 @@ class Prover:
                     floor = min(floor, last)
                 gap = float(gap_closed(np.array(first), np.array(last), floor)) if first > floor else None
         return tuple(found), gap
+
+
+def _times_floor(explanation: Explanation, refused: Collection[Instance]) -> float:
+    """Largest error of a channel in its floors, without the laws that were refused."""
+    problem, regression = explanation.search.problem, explanation.selection.regression
+    kept = [instance for instance in explanation.selection.fit.instances if instance not in refused]
+    left = np.where(problem.valid, regression.unwhitened_residual(regression.fit(kept)), 0.0)
+    sizes = np.sqrt(np.sum(left**2, axis=0) / np.maximum(problem.valid.sum(axis=0), 1))
+    return float(np.max(sizes / _floors(explanation, problem)))
 
 
 def _floors(explanation: Explanation, problem: RegressionProblem) -> FloatArray:

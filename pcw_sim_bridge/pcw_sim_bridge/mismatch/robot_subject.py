@@ -41,6 +41,7 @@ from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
 from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_squares
 from .rolling_model import ModelNumbers, model_awaits_compiling, twists
 from .rollout import Windows
+from .sensor_axes import unlike_axes
 from .subject import Opened
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
@@ -84,6 +85,8 @@ class RobotSubject:
                 f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
                 "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
             )
+        else:
+            warnings += unlike_axes(self._seen_robot(), recording)
         warnings += told_of(self._seen_robot(), doubtful_reports(self._seen_robot(), recording))
         started = recording.t0_ns * 1e-9
         finding = InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings), started)
