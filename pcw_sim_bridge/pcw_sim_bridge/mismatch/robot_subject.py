@@ -25,7 +25,6 @@ from pcw_description.robot_description import (
 )
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
-from ..plants.true_robot import as_it_really_is
 from .command_tracking import command_problems
 from .errors import MismatchError
 from .even_stamps import EvenStamps
@@ -35,18 +34,17 @@ from .joint_glitches import without_glitches
 from .long_recordings import part_of
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .reported_torques import doubtful_reports, told_of
-from .robot_channels import STILL_SPEED, RobotProblemBuilder
+from .robot_channels import RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
 from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_squares
-from .rolling_model import ModelNumbers, model_awaits_compiling, twists
+from .rolling_model import model_awaits_compiling
 from .rollout import Windows
 from .sensor_axes import unlike_axes
 from .subject import Opened
+from .wheel_agreement import contradictions
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
-CHECKED_ROWS = 300  # of a recording, to see whether it is of this robot at all
-CONTRADICTORY = 0.15  # of their speed, by which wheels of one robot do not contradict each other most of the time
 
 
 class RobotSubject:
@@ -79,14 +77,8 @@ class RobotSubject:
         self._check_sensors(path, recording)
         recording, jumps = without_glitches(EvenStamps().evenly_stamped(recording))
         warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *jumps]
-        apart = _contradiction(self._seen_robot(), recording)
-        if apart > CONTRADICTORY:
-            warnings.append(
-                f"joint_states: by this description the wheels contradict each other by {100 * apart:.0f} % of their speed "
-                "most of the time: it may be a recording of another robot, or in other units, or all of it slipping"
-            )
-        else:
-            warnings += unlike_axes(self._seen_robot(), recording)
+        against = contradictions(self._seen_robot(), recording)
+        warnings += against or unlike_axes(self._seen_robot(), recording)
         warnings += told_of(self._seen_robot(), doubtful_reports(self._seen_robot(), recording))
         started = recording.t0_ns * 1e-9
         finding = InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings), started)
@@ -221,22 +213,6 @@ def _missing_casters(robot: RobotDescription, recording: Recording) -> tuple[str
     joint_seen: BoolArray = np.asarray(np.isfinite(recording.joint_states.position).any(axis=0))
     missing = tuple(name for name, joints in zip(robot.caster_names, joint_seen, strict=True) if not joints.all())
     return missing if len(missing) < robot.n else ()
-
-
-def _contradiction(robot: RobotDescription, recording: Recording) -> float:
-    """Median of the largest slip that wheels show against each other over the fastest one's speed, where they move."""
-    joints = recording.joint_states
-    whole = np.isfinite(joints.position).all(axis=(1, 2)) & np.isfinite(joints.velocity).all(axis=(1, 2))
-    moving = np.flatnonzero(whole & (np.abs(joints.velocity[:, :, DRIVE]).max(axis=1) > STILL_SPEED))
-    rows = moving[:: max(1, len(moving) // CHECKED_ROWS)]
-    if len(rows) < CHECKED_ROWS // 10:
-        return 0.0
-    numbers = ModelNumbers.of(as_it_really_is(robot))
-    angle, rate = np.ascontiguousarray(joints.position[rows, :, STEER]), np.ascontiguousarray(joints.velocity[rows])
-    _, contradiction = twists(numbers, angle, rate)
-    slip = np.max(np.linalg.norm(contradiction, axis=2), axis=1)
-    along, across = numbers.radius * rate[:, :, DRIVE], numbers.caster_offset[:, 0] * rate[:, :, STEER]
-    return float(np.median(slip / np.hypot(along, across).max(axis=1)))
 
 
 def _has_effort(recording: Recording) -> bool:
