@@ -39,9 +39,9 @@ SMALLEST_SHARE = 0.10
 SMALLEST_PART = 0.02
 # So many deviations of what the model misjudges are more than that.
 BEYOND_DOUBT = 2.0
-# Tolerances by which no number is off in a robot that is this one: a gyro that turns the other way is not one whose scale is
-# 400 tolerances off, and what is left of it is not noise.
-FARTHEST = 10.0
+# Of a healthy robot's channels none is left twice its floor. Where one is left so many times, no number of the description
+# that is off by so many tolerances stands for it: a gyro that turns the other way is not one whose scale is 400 of them off.
+FAR_FROM_FLOOR, FARTHEST = 4.0, 10.0
 # No wheel is rounder, and no floor is more even, than that what it rolls is known better than to this part of its way.
 ROUNDNESS = 2e-4
 LARGEST_LAWS = 2
@@ -455,6 +455,17 @@ class OpenSetTest:
         self.bases = self._bases()
         self.noise = self._unexplained()
         self.regression = search.whiten_at(self.noise)
+        self._far = [self._is_far(channel) for channel in range(len(self.problem.channels))]
+
+    def _is_far(self, channel: int) -> bool:
+        """Whether what is left of a channel is far more than its noise, and than what the model misjudges."""
+        valid = self.problem.valid[:, channel]
+        if not valid.any():
+            return False
+        floor = robust_deviation(self.noise[valid, channel])
+        if self.problem.misjudged is not None:
+            floor = max(floor, float(np.sqrt(np.mean(self.problem.misjudged[valid, channel] ** 2))))
+        return float(np.sqrt(np.mean(self.residual[valid, channel] ** 2))) > FAR_FROM_FLOOR * floor
 
     def _bases(self) -> dict[tuple[int, str], tuple[FloatArray, FloatArray]]:
         """Basis columns (T, K) and knots by channel and variable."""
@@ -546,7 +557,8 @@ class OpenSetTest:
         self, channel: int, name: str, functions: FloatArray, knots: FloatArray, instances: Sequence[Instance]
     ) -> tuple[float, float, tuple[FloatArray, FloatArray]]:
         """Held-out gain [nats] and share of a function of one variable in one channel, fitted beside the set."""
-        augmented = AugmentedFit(self.regression, instances, channel, functions)
+        farthest = FARTHEST if self._far[channel] else np.inf
+        augmented = AugmentedFit(self.regression, instances, channel, functions, farthest)
         before, after = augmented.held_out_errors()
         # Few samples and many functions leave less than noise does; held-out errors say how much less.
         scale = max(after / self.regression.effective_rows, 1.0)
@@ -597,8 +609,16 @@ class AugmentedFit:
         instances: Sequence[Instance],
         channel: int,
         functions: FloatArray,
+        farthest: float = np.inf,
     ) -> None:
-        self.regression = regression
+        """Put a function's values (T, K) beside a set.
+
+        Args:
+            regression: with the noise to fit by; instances: the set.
+            channel: of the function; functions: its values.
+            farthest: tolerances by which no number of the description may be off.
+        """
+        self.regression, self.farthest = regression, farthest
         self.instances = tuple(instances)
         problem = regression.problem
         self.columns = np.zeros((*problem.residual.shape, functions.shape[1]))
@@ -634,12 +654,12 @@ class AugmentedFit:
         return np.stack([self._posterior(total - gram, len(self.deviations)) for gram in self._grams])
 
     def _posterior(self, gram: FloatArray, count: int) -> FloatArray:
-        """The first numbers (count,), none of the description's so far off that it would not be re-tuning any more."""
+        """The first numbers (count,), those of the description as far off as they may be."""
         precision = gram[:count, :count] + np.diag(1.0 / self.deviations[:count] ** 2)
         mean = np.asarray(np.linalg.solve(precision, gram[:count, -1]), dtype=np.float64)
         limits = np.full(count, np.inf)
         numbers = self.regression.problem.nuisances
-        limits[: len(numbers)] = [np.inf if number.loose else FARTHEST * number.deviation for number in numbers]
+        limits[: len(numbers)] = [np.inf if number.loose else self.farthest * number.deviation for number in numbers]
         if np.all(np.abs(mean) <= limits):
             return mean
         root = np.linalg.cholesky(precision)

@@ -23,6 +23,7 @@ from .findings import REFUSED, ChannelProof, FitFinding, LadderFinding, RolloutP
 from .found_effect import effect_instance
 from .held_out import HeldOut
 from .law_models import LawModels
+from .open_set import FAR_FROM_FLOOR
 from .paired_errors import PairedErrors, blocks_of, gap_closed, interval
 from .regression_problem import HEALTHY, FloatArray, IntArray, RegressionProblem
 from .rollout import HORIZONS, MAIN_HORIZON, RAN_AWAY, Windows
@@ -41,7 +42,6 @@ LEAST_DURATION = 2.0  # [s] of usable motion, to prove anything on
 ALLOWED_HARM = 0.01
 # Part of what no name explained from which a law is told of though other data contradict it.
 MOST_OF_IT = 0.5
-FAR_FROM_FLOOR = 4.0  # of a healthy robot's channels none leaves twice its floor
 # Kinds of numbers that move a simulated robot, by how their names begin. One kind may lead it astray, and foretell its own
 # channels well: what is wrong with the forces of tyres and bodies is put into masses.
 KINDS = (
