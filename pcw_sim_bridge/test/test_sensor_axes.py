@@ -67,12 +67,12 @@ def tracker_clockwise(truth: Any) -> Any:
     ("sensor", "change", "words"),
     [
         ("imu", gyro_back, ["imu/data: the gyro turns the other way"]),
-        ("imu", imu_turned(90.0), ["feels what the wheels do turned by 90 degrees"]),
+        ("imu", imu_turned(90.0), ["feels what the wheels do, but turned by 90 degrees"]),
         ("imu", imu_turned(180.0), ["turned by ", "180 degrees about z"]),
-        ("imu", imu_mirrored, ["imu/data: the accelerometer feels the mirror image"]),
+        ("imu", imu_mirrored, ["imu/data: the accelerometer feels what the wheels do, but mirrored"]),
         ("imu", imu_turned(10.0), []),
-        ("ground_truth", tracker_turned(90.0), ["ground_truth/odom: it moves what the wheels do turned by -90 degrees"]),
-        ("ground_truth", tracker_in_mm, ["ground_truth/odom: it moves ", " times as far as the wheels: is it in metres?"]),
+        ("ground_truth", tracker_turned(90.0), ["ground_truth/odom: it moves as the wheels do, but turned by -90 degrees"]),
+        ("ground_truth", tracker_in_mm, ["ground_truth/odom: it moves as the wheels do", "times as far: is it in metres?"]),
         ("ground_truth", tracker_clockwise, ["ground_truth/odom: it turns the other way"]),
     ],
 )

@@ -87,7 +87,8 @@ def _of_imu(robot: RobotDescription, wheels: FloatArray, sensed: FloatArray) -> 
     expected = (velocity[2:] - velocity[:-2]) / (2.0 * WINDOW) + 1j * rate[1:-1] * velocity[1:-1]
     felt = _complex(sensed)
     felt = 0.25 * felt[:-2] + 0.5 * felt[1:-1] + 0.25 * felt[2:]
-    return found + _in_words("imu/data: the accelerometer feels", felt - felt.mean(), expected - expected.mean(), None)
+    what = "imu/data: the accelerometer feels what the wheels do"
+    return found + _in_words(what, felt - felt.mean(), expected - expected.mean())
 
 
 def _of_tracker(robot: RobotDescription, wheels: FloatArray, pose: FloatArray) -> list[str]:
@@ -97,7 +98,8 @@ def _of_tracker(robot: RobotDescription, wheels: FloatArray, pose: FloatArray) -
         found.append("ground_truth/odom: it turns the other way than the wheels: is its yaw counted clockwise?")
     yaw = 0.5 * (pose[1:, 2] + pose[:-1, 2])
     own = _complex(moved) * np.exp(-1j * yaw)
-    return found + _in_words("ground_truth/odom: it moves", own, _complex(at_place(wheels, tracked_place(robot))), "far")
+    there = _complex(at_place(wheels, tracked_place(robot)))
+    return found + _in_words("ground_truth/odom: it moves as the wheels do", own, there, True)
 
 
 def _complex(values: FloatArray) -> np.ndarray:
@@ -109,21 +111,21 @@ def _turns_back(sensed: FloatArray, wheels: FloatArray) -> bool:
     return float(sensed @ wheels) < -ALIKE * float(np.linalg.norm(sensed) * np.linalg.norm(wheels)) < 0.0
 
 
-def _in_words(what: str, sensed: np.ndarray, wheels: np.ndarray, length: str | None) -> list[str]:
+def _in_words(what: str, sensed: np.ndarray, wheels: np.ndarray, is_length: bool = False) -> list[str]:
     """What is turned, mirrored or in other units of a motion in the plane (W,) that is the same otherwise."""
     size = float(np.linalg.norm(sensed) * np.linalg.norm(wheels))
     if size == 0.0:
         return []
     turned, mirrored = np.vdot(wheels, sensed), np.vdot(wheels.conj(), sensed)
     if abs(mirrored) > ALIKE * size and abs(mirrored) > abs(turned) + BETTER * size:
-        return [f"{what} the mirror image of what the wheels do: is one of its axes named otherwise?"]
+        return [f"{what}, but mirrored: is one of its axes named otherwise?"]
     if abs(turned) <= ALIKE * size:
         return []
     angle = float(np.angle(turned))
     if abs(angle) > TURNED:
         turn = f"turned by {math.degrees(angle):.0f} degrees about z"
-        return [f"{what} what the wheels do {turn}: is it mounted so? Its axes have to be those that the description says"]
+        return [f"{what}, but {turn}: is it mounted so? Its axes have to be those that the description says"]
     factor = abs(turned) / float(np.linalg.norm(wheels)) ** 2
-    if length and not 1.0 / SCALE < factor < SCALE:
-        return [f"{what} {factor:.3g} times as {length} as the wheels: is it in metres?"]
+    if is_length and not 1.0 / SCALE < factor < SCALE:
+        return [f"{what}, but {factor:.3g} times as far: is it in metres?"]
     return []
