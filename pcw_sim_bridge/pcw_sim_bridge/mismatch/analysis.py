@@ -99,7 +99,8 @@ def analyse(
         PcwError: a recording cannot be read.
     """
     begun = time.monotonic()
-    progress(f"reading {len(fit) + len(holdout)} recording(s)")
+    once = "; its model is compiled on the way, once after an installation" if subject.awaits_compiling() else ""
+    progress(f"reading {len(fit) + len(holdout)} recording(s){once}")
     opened, of_fit = subject.part_of([subject.open(path, "fit", topics) for path in fit], "searched")
     held_out, of_holdout = subject.part_of([subject.open(path, "holdout", topics) for path in holdout], "held out")
     for one in (*opened, *held_out):
@@ -108,8 +109,7 @@ def analyse(
     lengths = tuple(told for told in (of_fit, of_holdout) if told)
     for told in lengths:
         progress(told)
-    once = "; its model is compiled first, once after an installation" if subject.awaits_compiling() else ""
-    progress(f"building the channels{once}")
+    progress("building the channels")
     problem = subject.problem(opened)
     inputs = tuple(o.finding for o in (*opened, *held_out))
     judged = problem.valid.any(axis=1)
