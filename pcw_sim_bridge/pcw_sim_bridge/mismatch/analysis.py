@@ -154,9 +154,7 @@ def analyse(
         (False, False): "no_mismatch",
     }[bool(instances), bool(leftovers)]
     path = walked(problem, [subject.path(o) for o in opened])
-    # A law outside the library is a term of a later problem than the one it was looked for in.
-    found = [problem.terms[i.term] for i in explanation.fit.instances if i.term < len(problem.terms)]
-    arguments = [name for term in found for name in term.arguments]
+    arguments = [name for instance in explanation.fit.instances for name in problem.terms[instance.term].arguments]
     # The prediction belongs to the residual that is exact where the patch is, not to that of the description.
     other = None if prover.other is None else proof.held_out.problem
     findings = Findings(

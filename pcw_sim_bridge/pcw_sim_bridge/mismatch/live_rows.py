@@ -163,7 +163,7 @@ class RowReader:
         recording, told = without_glitches(self._stamps.evenly_stamped(Recording.of_messages(messages, self.robot)))
         return recording, RobotProblemBuilder(self.robot, [recording], self.cutoff, live=True), told
 
-    def go_on(self, recording: Recording, builder: RobotProblemBuilder, told: Sequence[str] = ()) -> Window:
+    def go_on(self, recording: Recording, builder: RobotProblemBuilder, told: Sequence[str]) -> Window:
         """Return what is new in a recording with its builder, and go on from there; told: what was wrong with it."""
         window = self._window(recording, builder, told)
         start = recording.t0_ns / NANOSECONDS
