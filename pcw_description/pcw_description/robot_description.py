@@ -37,6 +37,7 @@ AXLE_DISTANCE, AXLE_ANGLE = 0.02, 0.02  # [m], [rad]
 STATIC_DEFLECTION = 1.5e-3
 SUSPENSION_DAMPING_RATIO = 0.4
 GRAVITY = 9.81  # [m/s^2]
+POSSIBLE_MARGIN = 1.01  # above the inertia that a module of points and a flat wheel would have
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -639,3 +640,18 @@ def thinnest_module_inertia(caster: Caster) -> float:
     fork_mass = module.mass - wheel.mass
     from_com = math.dist(module.com, caster.caster_offset)
     return wheel.inertia_axle / 2.0 + wheel.mass * from_com**2 * (1.0 + wheel.mass / fork_mass)
+
+
+def possible_caster(caster: Caster) -> Caster:
+    """Return the caster with inertias that matter can have, where its wheel or its place were changed alone.
+
+    Args:
+        caster: with numbers from anywhere: an effect, or a fit in which they hardly show.
+    """
+    wheel = dataclasses.replace(
+        caster.wheel, inertia_axle=min(caster.wheel.inertia_axle, caster.wheel.mass * caster.wheel_radius**2)
+    )
+    caster = dataclasses.replace(caster, wheel=wheel)
+    least = POSSIBLE_MARGIN * thinnest_module_inertia(caster)
+    module = dataclasses.replace(caster.module, inertia_zz=max(caster.module.inertia_zz, least))
+    return dataclasses.replace(caster, module=module)

@@ -23,7 +23,7 @@ import pcw_description.effects
 from pcw_description import DescriptionError, load_robot
 from pcw_description.effects import registry
 from pcw_description.effects.effect import Effect, EffectParameter
-from pcw_description.effects.kinds import JointTorqueEffect
+from pcw_description.effects.kinds import DescriptionEffect, JointTorqueEffect
 from pcw_description.effects.registry import all_effects, get, read_physics
 
 # INTERFACES, section 5, and in the last line what it has grown by: every name here has a file, and every file a name.
@@ -196,6 +196,22 @@ def test_asymmetry_is_half_the_difference_of_the_directions(axis: str, size: str
         np.zeros(2), np.array([2.0, -2.0]), np.zeros(2), np.zeros(2), typical(effect) | {size: 1.0, "asymmetry": 0.25}
     ) / (2.0 if size == "viscous" else 1.0)
     assert (-forwards, backwards) == pytest.approx((1.25, 0.75))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"), [("caster_offset_error", {"x": 0.3, "y": 0.4}), ("wheel_radius_error", {"error": -0.06})]
+)
+def test_a_wheel_that_is_far_from_its_description_is_one_that_can_be(name: str, parameters: dict[str, float]) -> None:
+    """It is refused as a description where its inertias are those of the wheel before."""
+    robot = load_robot("thesis")
+    effect = get(name)
+    assert isinstance(effect, DescriptionEffect)
+    [changed, *others] = effect.apply(robot, robot.caster_names[:1], parameters).casters
+    assert changed.module.inertia_zz >= robot.casters[0].module.inertia_zz
+    assert changed.wheel.inertia_axle <= changed.wheel.mass * changed.wheel_radius**2
+    assert others == list(robot.casters[1:])
+    little = effect.apply(robot, robot.caster_names[:1], {key: 1e-3 * value for key, value in parameters.items()}).casters[0]
+    assert (little.module, little.wheel) == (robot.casters[0].module, robot.casters[0].wheel)
 
 
 def test_unknown_effect_suggests_the_nearest() -> None:

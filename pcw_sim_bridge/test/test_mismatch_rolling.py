@@ -155,7 +155,25 @@ def made_swerve(path: Path, seed: int, steer_offset: float = 0.0, radius_error: 
     return described, rolling_cases.write(path, described, joints, pose, rng, offsets)
 
 
-@pytest.mark.parametrize(("make", "seed"), [(made_tricycle, 0), (made_tricycle, 1), (made_swerve, 0)])
+def made_axle(path: Path, seed: int, track_error: float = 0.0, radius_error: float = 0.0) -> Made:
+    """Two driven wheels beside each other that never steer, as of a skid-steered robot; the track is that of both."""
+    rng = np.random.default_rng(seed)
+    base = tricycle()
+    wheels = [
+        dataclasses.replace(base.casters[0], name=name, steer_axis=(0.0, y), wheel_radius=0.15)
+        for name, y in (("left", 0.3), ("right", -0.3))
+    ]
+    described = dataclasses.replace(base, casters=tuple(wheels), fixed_wheels=())
+    true = described.with_casters(["left"], lambda c: dataclasses.replace(c, steer_axis=(0.0, 0.3 + track_error)))
+    true = true.with_casters(
+        ["right"],
+        lambda c: dataclasses.replace(c, steer_axis=(0.0, -0.3 - track_error), wheel_radius=0.15 + radius_error),
+    )
+    joints, pose = rolling_cases.axle_motion(true, 60.0, rng)
+    return described, rolling_cases.write(path, described, joints, pose, rng)
+
+
+@pytest.mark.parametrize(("make", "seed"), [(made_tricycle, 0), (made_tricycle, 1), (made_swerve, 0), (made_axle, 0)])
 def test_of_a_healthy_robot_nothing_is_named(make: Callable[..., Made], seed: int, tmp_path: Path) -> None:
     assert analysed(*make(tmp_path / "bag", seed)).findings.verdict == "no_mismatch"
 
@@ -203,6 +221,30 @@ def test_the_wheel_of_a_swerve_drive_is_named(fault: dict[str, float], found: st
     assert estimate.low < next(iter(fault.values())) < estimate.high
     channels = [channel.name for channel in analysis.findings.channels]
     assert "rolling_consistency/front_left_lateral" in channels and "pose/yaw" in channels
+
+
+def test_the_smaller_one_of_two_wheels_that_never_steer_is_named(tmp_path: Path) -> None:
+    """Wheels in a line, which cannot contradict each other: it ended in a traceback."""
+    analysis = analysed(*made_axle(tmp_path / "bag", 0, radius_error=-0.01))
+    assert named(analysis) == ["wheel_radius_error/right"]
+    estimate = analysis.findings.effects[0].parameters["error"]
+    assert estimate.low < -0.01 < estimate.high
+    assert not any(c.flagged for c in analysis.findings.channels if c.name.startswith("rolling_consistency"))
+
+
+@pytest.mark.parametrize("error", [0.05, 0.2])
+def test_a_track_that_is_wider_than_described_is_found_and_can_be_simulated(error: float, tmp_path: Path) -> None:
+    """As of a robot that scrubs when it turns. Beyond 0.16 m the module's inertia made it a robot that cannot be."""
+    robot, path = made_axle(tmp_path / "bag", 0, track_error=error)
+    analysis = analysed(robot, path)
+    assert {tuple(effect.target): effect.name for effect in analysis.findings.effects} == {
+        ("left",): "caster_offset_error", ("right",): "caster_offset_error",
+    }  # fmt: skip
+    for effect in analysis.findings.effects:
+        assert abs(effect.parameters["y"].value) == pytest.approx(error, rel=0.05)
+    patched = analysis.patched
+    assert isinstance(patched, RobotSubject)
+    assert analysed(patched.robot, path).findings.verdict == "no_mismatch"
 
 
 # --- Parts ---------------------------------------------------------------------------------------------------------------

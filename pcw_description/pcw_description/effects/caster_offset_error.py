@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from ..robot_description import RobotDescription
+from ..robot_description import RobotDescription, possible_caster
 from .effect import EffectParameter
 from .kinds import DescriptionEffect
 
@@ -12,9 +12,9 @@ def with_other_offset(robot: RobotDescription, target: Sequence[str], parameters
     """Return the robot with (x, y) added to the caster offset of each target."""
     return robot.with_casters(
         target,
-        lambda caster: dataclasses.replace(
+        lambda caster: possible_caster(dataclasses.replace(
             caster, caster_offset=(caster.caster_offset[0] + parameters["x"], caster.caster_offset[1] + parameters["y"])
-        ),
+        )),
     )
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from ..robot_description import RobotDescription
+from ..robot_description import RobotDescription, possible_caster
 from .effect import EffectParameter
 from .kinds import DescriptionEffect
 
@@ -15,7 +15,8 @@ def with_other_radius(robot: RobotDescription, target: Sequence[str], parameters
         DescriptionError: no radius is left.
     """
     return robot.with_casters(
-        target, lambda caster: dataclasses.replace(caster, wheel_radius=caster.wheel_radius + parameters["error"])
+        target,
+        lambda caster: possible_caster(dataclasses.replace(caster, wheel_radius=caster.wheel_radius + parameters["error"])),
     )
 
 

@@ -406,7 +406,7 @@ def _notes(
     rotary = problem.channels[0].name == "axis_force" and problem.channels[0].unit == "N m"
     if rotary and "gravity_moment" not in numbers and any(left.variable == "position" for left in explanation.leftovers):
         notes.append("What depends on the angle may be gravity on an arm: give the description a gravity_arm.")
-    share = float(problem.valid.mean())
+    share = float(problem.valid[:, problem.valid.any(axis=0)].mean()) if problem.valid.any() else 0.0
     if share < 0.9:
         notes.append(f"{100 * (1 - share):.0f} % of the samples could not be judged (standstill, gross slip or missing data).")
     return tuple(notes)

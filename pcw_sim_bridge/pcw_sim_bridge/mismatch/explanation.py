@@ -734,14 +734,15 @@ def _p_values(search: EffectSearch, selection: Selection, result: OpenSetResult)
     """
     problem, regression, fit = search.problem, selection.regression, selection.fit
     count = len(problem.nuisances)
-    channels = len(problem.channels)
     effects = regression.design(fit.instances)[:, count:] @ fit.mean[count:] if fit.instances else None
     further = regression.scan(fit.instances)[0]
     gain = max((c.gain for c in further), default=0.0)
     place, spread = search.noise_gain
     idle = -math.expm1(-math.exp(min(-(gain - place) / spread, 50.0))) if math.isfinite(gain) else 1.0
-    values = np.full(channels, min(1.0, max(idle, 0.0)))
-    for channel in range(channels):
+    # A channel in which no sample can be judged says nothing.
+    seen = problem.valid.any(axis=0)
+    values = np.where(seen, min(1.0, max(idle, 0.0)), 1.0)
+    for channel in np.flatnonzero(seen):
         leftover = next(
             (left for left in result.leftovers if left.channel == problem.channels[channel].name), None
         )

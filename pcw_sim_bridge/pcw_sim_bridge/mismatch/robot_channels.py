@@ -61,6 +61,7 @@ USED_PART = 0.8
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
 TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
+ROUNDING = 1e-9  # of what wheels roll; contradictions below it are those of arithmetic
 SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slips to and fro is less than at its average slip
@@ -305,7 +306,15 @@ class RobotProblemBuilder:
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
             pieces.append((bad[:, None] | ~known).astype(float))
-        return differences.filtered(pieces) < 0.1
+        return (differences.filtered(pieces) < 0.1) & ~self._silent(differences)
+
+    def _silent(self, differences: ChannelDifferences) -> BoolArray:
+        """Channels (C,) in which wheels say nothing of one another, such as those of one axle that never turn."""
+        silent = np.zeros(len(self.channels()), dtype=bool)
+        contradicted = np.max(np.abs(differences.measured[:, self.layout.consistency]), axis=0, initial=0.0)
+        rolled = max(float(np.max(np.abs(motion.velocity[:, :, DRIVE]))) for motion in self.motions)
+        silent[self.layout.consistency] = contradicted < ROUNDING * rolled * float(np.max(self.numbers.radius))
+        return silent
 
     def _remarks(self) -> tuple[str, ...]:
         """What keeps samples from being judged that a user can mend."""

@@ -21,7 +21,7 @@ from pcw_description.robot_description import (
     Caster,
     ContactDescription,
     RobotDescription,
-    thinnest_module_inertia,
+    possible_caster,
 )
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
@@ -341,15 +341,9 @@ def _with_tyres(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotD
 
 
 def _possible(caster: Caster) -> Caster:
-    """The caster with inertias that matter can have: where they hardly show in a recording, a fit may leave these bounds."""
-    wheel = dataclasses.replace(
-        caster.wheel, inertia_axle=min(caster.wheel.inertia_axle, caster.wheel.mass * caster.wheel_radius**2)
-    )
-    mass = max(caster.module.mass, (1.0 + LEAST_PART) * wheel.mass)
-    caster = dataclasses.replace(caster, wheel=wheel, module=dataclasses.replace(caster.module, mass=mass))
-    least = (1.0 + LEAST_PART) * thinnest_module_inertia(caster)
-    module = dataclasses.replace(caster.module, inertia_zz=max(caster.module.inertia_zz, least))
-    return dataclasses.replace(caster, module=module)
+    """The caster with masses that it can have: where they hardly show in a recording, a fit may leave these bounds."""
+    mass = max(caster.module.mass, (1.0 + LEAST_PART) * caster.wheel.mass)
+    return possible_caster(dataclasses.replace(caster, module=dataclasses.replace(caster.module, mass=mass)))
 
 
 def _positive(value: float, nominal: float) -> float:

@@ -406,6 +406,8 @@ class _TermMaker:
     def _grid(self, effect: Effect) -> ChosenShapes | None:
         """Grid of the shaping parameters of an effect and its spacing; None where one can neither be searched nor left."""
         reach = np.max(np.abs(self.robot.steer_axis), axis=0)
+        # Wheels on one line say nothing of how far the robot reaches across it.
+        reach = np.where(reach > 0.0, reach, 0.5 * np.asarray(self.robot.chassis.size[:2]))
         searched = {p.name for p in (*effect.searched_parameters, *self._searched(effect))}
         shapes: list[dict[str, float]] = [{}]
         resolution: dict[str, tuple[str, float]] = {}

@@ -21,6 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 RATE = 25.0  # [Hz]
 FINE = 20  # steps of the integration per sample
 START_NS = 1_000_000_000
+ANGLE_NOISE = 5e-4  # [rad], of joints that turn at all
 
 
 def smooth_signal(time: FloatArray, size: float, slowest: float, rng: np.random.Generator) -> FloatArray:
@@ -56,6 +57,15 @@ def swerve_motion(robot: RobotDescription, duration: float, rng: np.random.Gener
     return np.stack([roll, heading], axis=2)[::FINE], pose[::FINE]
 
 
+def axle_motion(robot: RobotDescription, duration: float, rng: np.random.Generator) -> tuple[FloatArray, ...]:
+    """Joint angles (T, 2, 2) and pose (T, 3) of two driven wheels beside each other that never steer."""
+    time = np.arange(0.0, duration, 1.0 / (RATE * FINE))
+    along, yaw_rate = 0.3 + smooth_signal(time, 0.3, 0.35, rng), smooth_signal(time, 0.6, 0.4, rng)
+    roll = _sum((along[:, None] - yaw_rate[:, None] * robot.steer_axis[:, 1]) / robot.wheel_radius)
+    pose = _integrated(np.stack([along, np.zeros_like(time), yaw_rate], axis=1))
+    return np.stack([roll, np.zeros_like(roll)], axis=2)[::FINE], pose[::FINE]
+
+
 def write(
     path: Path,
     robot: RobotDescription,
@@ -77,7 +87,7 @@ def write(
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     tracked = pose + np.stack([c * x - s * y, s * x + c * y, np.full(len(pose), yaw)], axis=1)
     tracked += rng.standard_normal(tracked.shape) * [tracker.position_noise, tracker.position_noise, tracker.yaw_noise]
-    read = joints + 5e-4 * rng.standard_normal(joints.shape)
+    read = joints + ANGLE_NOISE * np.any(joints, axis=0) * rng.standard_normal(joints.shape)
     for name, offset in (steer_offset or {}).items():
         read[:, robot.caster_index(name), STEER] += offset
     with RecordingWriter(path) as writer:
