@@ -153,7 +153,7 @@ def test_asymmetry_is_named_where_it_is(effects: tuple[str, ...], asymmetric: st
     assert explanation.complete
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2, 3))])
 @pytest.mark.parametrize("asymmetric", [True, False], ids=["a friction by direction", "a load"])
 def test_a_load_and_a_friction_by_direction_are_one_or_the_other(asymmetric: bool, seed: int) -> None:
     """They differ at rest only. The friction by direction was a symmetric one and a load, both named as sure."""

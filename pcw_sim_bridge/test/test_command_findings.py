@@ -84,7 +84,7 @@ def test_a_dead_time_of_many_cycles_is_as_long_as_it_is():
     assert estimate.low < 0.01116 < estimate.high and estimate.value == pytest.approx(0.01116, rel=0.02)
 
 
-@pytest.mark.parametrize("searched", [True, False])
+@pytest.mark.parametrize("searched", [pytest.param(True, marks=pytest.mark.nightly), False])
 def test_a_proof_needs_no_numbers_to_try(searched):
     """Those for the held-out joints were half of the work of this search."""
     effect = EffectInstance("actuator_delay", ROBOT.caster_names, {"delay": 0.011}, "steer")
@@ -160,7 +160,7 @@ def test_one_joint_at_fault_is_named_alone():
     assert {place.casters for place in findings.locations} == {effect.target for effect in effects}
 
 
-@pytest.mark.parametrize("lagging", [slice(None), slice(0, 1)])
+@pytest.mark.parametrize("lagging", [pytest.param(slice(None), marks=pytest.mark.nightly), slice(0, 1)])
 def test_what_no_joint_says_clearly_enough_all_of_them_may(lagging):
     """Of gentle motion each of four steerings had 3 nats for a lag, none was named, and nothing was missing."""
     robot = load_robot("tidybot2")

@@ -57,7 +57,10 @@ def test_a_payload_at_the_wrong_place_and_what_makes_up_for_it_may_be_one_payloa
     assert offered(8, 6) == []
 
 
-@pytest.mark.parametrize(("radii", "found"), [((7.6e-3,) * 4, 1), ((7.6e-3, 5.0e-3, 7.6e-3, 7.6e-3), 4)])
+@pytest.mark.parametrize(
+    ("radii", "found"),
+    [((7.6e-3,) * 4, 1), pytest.param((7.6e-3, 5.0e-3, 7.6e-3, 7.6e-3), 4, marks=pytest.mark.nightly)],
+)
 def test_casters_that_scrub_alike_are_one_fault_of_all_also_where_each_was_found_exactly(radii, found):
     """From where the problem is exact with four of them, one on all in their place explains nothing to first order."""
     robot = load_robot("dyros_pcv")
@@ -75,7 +78,9 @@ def test_casters_that_scrub_alike_are_one_fault_of_all_also_where_each_was_found
     assert len(search.gathered(each).fit.instances) == found
 
 
-@pytest.mark.parametrize(("loaded", "displaced"), [(True, False), (True, True), (False, False)])
+@pytest.mark.parametrize(
+    ("loaded", "displaced"), [pytest.param(True, False, marks=pytest.mark.nightly), (True, True), (False, False)]
+)
 def test_weak_drives_and_steerings_are_a_payload_unless_the_recording_objects(loaded, displaced):
     """Torques too small by one factor are masses too large by it; two effects with strained numbers may fit better.
 
@@ -108,7 +113,7 @@ def test_weak_drives_and_steerings_are_a_payload_unless_the_recording_objects(lo
         assert np.hypot(place["x"] + 0.15, place["y"] + 0.01) < 0.02
 
 
-@pytest.mark.parametrize("by_load", [True, False])
+@pytest.mark.parametrize("by_load", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_a_friction_and_a_resistance_at_one_wheel_are_a_resistance_at_all_of_them_unless_the_recording_objects(by_load):
     """From where both are named neither gives way to one more: what tells them apart, the load, was judged beside them."""
     robot = load_robot("thesis")

@@ -121,11 +121,11 @@ def test_a_simulated_robot_with_concealed_friction_is_found_out(tmp_path: Path) 
         "drive_coulomb_friction", (caster,), {"coulomb": coulomb, "asymmetry": 0.0, "smoothing_speed": 0.05}
     )
     true_robot = dataclasses.replace(nominal, physics=(friction,))
-    record_run(true_robot, wandering, 25.0, 1, tmp_path / "fit", "pybullet", controlled_as=nominal)
+    record_run(true_robot, wandering, 15.0, 1, tmp_path / "fit", "pybullet", controlled_as=nominal)
     record_run(
         true_robot,
         lambda t: wandering(t + 40.0) * min(t, 1.0),
-        12.0,
+        8.0,
         2,
         tmp_path / "other",
         "pybullet",
@@ -194,7 +194,7 @@ def test_a_healthy_robot_has_nothing_missing(tmp_path: Path) -> None:
         for caster, scale in zip(nominal.casters, (1.001, 0.9995, 1.0, 0.999), strict=True)
     )
     healthy = dataclasses.replace(nominal, chassis=chassis, casters=casters)
-    record_run(healthy, wandering, 20.0, 5, tmp_path / "run", "reduced", controlled_as=nominal)
+    record_run(healthy, wandering, 12.0, 5, tmp_path / "run", "reduced", controlled_as=nominal)
     done = analyze(tmp_path / "run", "--robot", "thesis", "--out", tmp_path / "report", "--quiet")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

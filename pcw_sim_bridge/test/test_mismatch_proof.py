@@ -297,7 +297,7 @@ def test_numbers_that_no_description_holds_are_in_the_patch_as_effects(deviating
     assert after < 0.1 * before
 
 
-@pytest.mark.parametrize("besides", [False, True])
+@pytest.mark.parametrize("besides", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_what_is_retuned_beside_effects_of_other_channels_is_proved(deviating: Path, besides: bool) -> None:
     """A healthy robot is left as it is described; where something else makes a patch, re-tuned numbers are in it and help."""
     nominal = RobotSubject(THESIS)

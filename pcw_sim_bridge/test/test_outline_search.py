@@ -67,8 +67,13 @@ def shaped(outline: dict[str, float]) -> Instance:
     "outline",
     [
         {"x": 0.1, "y": 0.02, "length": 0.66, "width": 0.38, "yaw": 0.7, "roundness": 0.0},
-        {"x": 0.03, "y": 0.12, "length": 0.8, "width": 0.5, "yaw": -0.5, "roundness": 1.0},
-        {"x": 0.05, "y": 0.05, "length": 0.45, "width": 0.45, "yaw": 0.0, "roundness": 1.0},
+        *(
+            pytest.param(outline, marks=pytest.mark.nightly)
+            for outline in (
+                {"x": 0.03, "y": 0.12, "length": 0.8, "width": 0.5, "yaw": -0.5, "roundness": 1.0},
+                {"x": 0.05, "y": 0.05, "length": 0.45, "width": 0.45, "yaw": 0.0, "roundness": 1.0},
+            )
+        ),
     ],
 )
 def test_the_outline_of_a_patch_is_found_from_that_of_a_disc(outline):

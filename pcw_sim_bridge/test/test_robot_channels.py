@@ -156,7 +156,10 @@ def test_a_healthy_robot_leaves_next_to_nothing(tmp_path: Path, plant: str) -> N
     assert np.all(residual[-3:] < 8e-3)
 
 
-@pytest.mark.parametrize(("sensor", "pause"), [("imu", 0.06), ("imu", 0.5), ("ground_truth", 0.3)])
+@pytest.mark.parametrize(
+    ("sensor", "pause"),
+    [("imu", 0.06), pytest.param("imu", 0.5, marks=pytest.mark.nightly), ("ground_truth", 0.3)],
+)
 def test_a_pause_of_a_sensor_reaches_nothing_beside_it(tmp_path: Path, sensor: str, pause: float) -> None:
     """In its place stood zeros: a turning robot's gyro was off by tenths of its speed for half a second on either side."""
     whole = record(tmp_path, THESIS, 1, twist=lambda time: min(time, 1.0) * np.array([0.3, 0.0, 0.6]))
@@ -576,7 +579,7 @@ def test_a_tyre_near_its_peak_is_not_asked_how_much_it_slips() -> None:
     )
 
 
-@pytest.mark.parametrize("own", [None, 0.04])
+@pytest.mark.parametrize("own", [pytest.param(None, marks=pytest.mark.nightly), 0.04])
 def test_a_tyre_relaxes_from_its_own_length_on(tmp_path: Path, own: float | None) -> None:
     """Of casters with tyres of their own the column was taken from the floor's length on, and was of the wrong sign."""
     names = THESIS.caster_names

@@ -20,7 +20,9 @@ from pcw_sim_bridge.traction_test import measure_traction, traction_rig
 SUSPENSION_TOLERANCE = 0.02
 
 
-@pytest.mark.parametrize("speed", [0.2, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize(
+    "speed", [*(pytest.param(speed, marks=pytest.mark.nightly) for speed in (0.2, 1.0)), 0.5, 2.0]
+)
 def test_traction_test_measures_the_peak_friction(engine: str, speed: float) -> None:
     """One wheel of the rig spun against two: the peak is mu_p within 1 % at 0.2 m/s and above, where it should be."""
     robot = load_robot("thesis")

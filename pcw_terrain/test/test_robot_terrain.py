@@ -227,7 +227,7 @@ def test_it_ends_at_once_when_another_wheel_slips_when_cancelled_and_when_it_tak
     assert state.refusal is Refusal.TOO_LONG
 
 
-@pytest.mark.parametrize("heading", [0.0, 0.9])
+@pytest.mark.parametrize("heading", [pytest.param(0.0, marks=pytest.mark.nightly), 0.9])
 @pytest.mark.parametrize("tested", range(4))
 @pytest.mark.parametrize("fraction", [0.8, -0.8, 1.25, -1.25])
 def test_it_ends_at_the_slip_of_another_wheel_that_it_says_whichever_wheel_it_is(fraction, tested, heading):

@@ -127,7 +127,7 @@ def test_braking_and_driving_backwards_give_the_same_as_driving():
     np.testing.assert_allclose(forth[:IS_VALID], back[:IS_VALID], rtol=1e-9)
 
 
-@pytest.mark.parametrize("case", ["thesis", "swept"])
+@pytest.mark.parametrize("case", [pytest.param("thesis", marks=pytest.mark.nightly), "swept"])
 def test_intervals_are_as_wide_as_the_errors(case):
     """Errors over their standard deviations scatter by 1; 150 of them tell that to 6 %. The noise of the wheel's acceleration,
     which cancels from block to block, was once counted as if it did not: 0.6 for mu_p with the settings of the thesis. At low
