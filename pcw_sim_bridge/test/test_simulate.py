@@ -113,8 +113,8 @@ def test_physics_is_at_work_and_the_controller_does_not_know(tmp_path):
         for name, given in (("inline", friction), ("file", str(file)), ("list", f"[{friction}]"))
     )
     assert digest(tmp_path / "inline/bag") == digest(tmp_path / "file/bag") == digest(tmp_path / "list/bag")
-    runs = [simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="15")]
-    runs.append(simulated(tmp_path / "rubbing", "--ideal", "--physics", friction, excite="circle", duration="15"))
+    runs = [simulated(tmp_path / "healthy", "--ideal", excite="circle", duration="20")]
+    runs.append(simulated(tmp_path / "rubbing", "--ideal", "--physics", friction, excite="circle", duration="20"))
     middle = (runs[0].joint_states.stamp > 8.0) & (runs[0].joint_states.stamp < 12.0)
     before, after = (recording.joint_states.effort[middle, :, 0].sum(axis=1).mean() for recording in runs)
     assert abs(before) < 0.1
