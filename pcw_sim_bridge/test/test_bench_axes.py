@@ -2,7 +2,8 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -200,6 +201,57 @@ def test_an_arm_that_the_description_lacks_or_has_wrong_depends_on_the_angle(des
     assert entry.estimates["order"].value == 1.0
     values = {name: estimate.value for name, estimate in entry.estimates.items()}
     assert "gravity on an arm of" in AxisSubject(case.axis).statement(effect("motor_cogging", **values))
+
+
+TURNED = np.arange(0.0, 20.0, 0.002)  # [s]
+INERTIA, FIRM = 0.01, 0.05  # [kg m^2]; [rad] over which friction builds up
+Torque = Callable[[np.ndarray, np.ndarray], np.ndarray]  # of angle and speed
+
+
+def presliding(angle: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Friction of 0.1 N m that builds up over a way, as of seals and balls (Dahl)."""
+    state, torque = 0.0, np.empty_like(angle)
+    for k, way in enumerate(np.diff(angle, prepend=angle[0])):
+        state += way - abs(way) * state / FIRM
+        torque[k] = 0.1 * state / FIRM
+    return torque
+
+
+def found_beyond(torque: Torque) -> Explanation:
+    """Explain a rotary axis that is turned to and fro, with a torque that no effect of the library makes."""
+    rng = np.random.default_rng(4)
+    waves = [(2.0, 0.9, 0.3), (1.2, 1.7, 1.0), (0.5, 4.1, 2.0)]  # [rad], [rad/s], [rad]
+    angle = sum(size * np.sin(rate * TURNED + phase) for size, rate, phase in waves)
+    speed = sum(size * rate * np.cos(rate * TURNED + phase) for size, rate, phase in waves)
+    acceleration = -sum(size * rate**2 * np.sin(rate * TURNED + phase) for size, rate, phase in waves)
+    force = INERTIA * acceleration + torque(angle, speed) + 2e-3 * rng.standard_normal(len(TURNED))
+    case = draw_bench_case(rng, kind="rotary")
+    recording = dataclasses.replace(
+        case.recordings[0], time=TURNED, position=angle + 1e-5 * rng.standard_normal(len(TURNED)), velocity=None,
+        force=force, external_force=np.zeros_like(force),
+    )  # fmt: skip
+    builder = AxisProblemBuilder(dataclasses.replace(case.axis, inertia=INERTIA, gravity_arm=None), [recording])
+    return explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
+
+
+def test_friction_that_builds_up_over_a_way_is_no_viscous_friction() -> None:
+    """Half of it was named Coulomb friction, and with certainty a viscous one that was not there."""
+    explanation = found_beyond(presliding)
+    assert explanation.named == ()
+    [left] = explanation.leftovers
+    assert left.depends_on == ("travel_since_reversal", "velocity")
+    assert left.expression is not None
+    size, twice, way = map(float, re.findall(r"\d+\.\d+", left.expression))
+    assert (size, twice, way) == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1), pytest.approx(FIRM, rel=0.2))
+
+
+def test_a_spring_is_no_row_of_waves_that_are_longer_than_its_travel() -> None:
+    """Four coggings, two of them of a fifth and half a period per turn, each with p = 1."""
+    explanation = found_beyond(lambda angle, speed: 0.01 * angle**3)
+    assert explanation.named == ()
+    [left] = explanation.leftovers
+    assert left.depends_on == ("position",)
+    assert left.expression is not None and left.expression.endswith("position**3")
 
 
 def with_signals(case: BenchCase, position: np.ndarray, force: np.ndarray) -> AxisProblemBuilder:

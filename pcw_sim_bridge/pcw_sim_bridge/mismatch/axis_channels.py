@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -33,6 +34,7 @@ from .regression_problem import (
     Term,
 )
 from .signal_filter import SignalFilter, derivative, refined, uniform_segments, white_noise_level
+from .unknown_law import TRAVEL
 
 LARGEST_CUTOFF = (
     40.0  # [Hz]; above it real drives show the resonances of their structure, which no effect here describes
@@ -51,13 +53,14 @@ LARGEST_ORDER_GRID = 1500
 # Coggings that count as known when a force is predicted or the smoothing chosen: so many, each explaining such a part of
 # what the others leave, and such a part of the measured force.
 LEADING_PERIODIC, SMALLEST_PERIODIC, SMALLEST_PERIODIC_FORCE = 8, 0.05, 0.003
+MOST_OF_A_TURN = 0.75
 # Parameters that only smooth a sign: one value serves all effects of an axis, chosen once.
 SMOOTHING = "smoothing_speed"
 
 
 @dataclasses.dataclass(frozen=True)
 class AxisMotion:
-    """One contiguous piece after the wide filter, refined; arrays (T,)."""
+    """One contiguous piece after the wide filter, refined; arrays (T,). Below the speed `slow` it may as well stand still."""
 
     recording: int
     time: FloatArray
@@ -65,6 +68,7 @@ class AxisMotion:
     velocity: FloatArray
     acceleration: FloatArray
     force: FloatArray
+    slow: float
     still: FloatArray
 
 
@@ -120,6 +124,7 @@ def axis_motion(
                 velocity=speed,
                 acceleration=acceleration,
                 force=force,
+                slow=floor,
                 still=_long_runs(np.abs(speed) <= floor, int(0.05 * factor * rate)),
             )
         )
@@ -357,6 +362,8 @@ class AxisProblemBuilder:
         variables = dict(self._variables)
         variables["time"] = time
         variables["force"] = self._filtered(self._smooth_forces)
+        travels = [travel_since_reversal(m.position, m.velocity, m.slow) for m in self.motions]
+        variables[TRAVEL] = self._filtered(travels)
         terms = [self._term(effect, smoothing) for effect in candidate_effects()]
         return RegressionProblem(
             channels=(Channel("axis_force", axis.unit("N m"), axis="drive"),),
@@ -386,7 +393,9 @@ class AxisProblemBuilder:
         }
         variables["time"] = np.concatenate([m.time - start[m.recording] for m in motions])
         variables["force"] = np.concatenate(self._smooth_forces)
-        return Sites(("axis_force",), variables, smoothing, columns)
+        variables[TRAVEL] = np.concatenate([travel_since_reversal(m.position, m.velocity, m.slow) for m in motions])
+        angles = ("position",) if self.axis.kind == "rotary" and np.ptp(variables["position"]) > 2.0 * np.pi else ()
+        return Sites(("axis_force",), variables, smoothing, columns, angles, max(m.slow for m in motions))
 
     def _contributions(
         self, effect: JointTorqueEffect, parameters: dict[str, float] | Shape
@@ -443,6 +452,7 @@ class AxisProblemBuilder:
             arguments=kernel_arguments(effect.name),
             repeatable=periodic is not None,
             resolution=resolution,
+            least={periodic: self._least_order(shapes[0][periodic])} if periodic is not None else {},
             whole=(periodic,) if periodic is not None and self.axis.kind == "rotary" else (),
             scan=(lambda: self._periodic_scan(effect, shapes, periodic)) if periodic is not None else None,
         )
@@ -480,6 +490,11 @@ class AxisProblemBuilder:
         grid = np.linspace(parameter.lower, parameter.upper, 12)
         return grid, "linear", float(grid[1] - grid[0])
 
+    def _least_order(self, first: float) -> float:
+        """Below what no order is searched, the grid beginning at the first: that of a turn is one where most of a turn was seen."""
+        turns = float(np.ptp(self._variables["position"])) / (2.0 * np.pi)
+        return min(first, 1.0) if self.axis.kind == "rotary" and turns > MOST_OF_A_TURN else first
+
     def _periodic_scan(self, effect: JointTorqueEffect, shapes: Sequence[Shape], name: str) -> FloatArray:
         """Columns of all shapes of an effect periodic in position, (T, 1, shapes, P), evaluated at the channel's rate.
 
@@ -499,6 +514,24 @@ class AxisProblemBuilder:
                 scanned[:, 0, index, column] = -by_name[parameter.name] * attenuation
         self._scans[effect.name] = scanned
         return scanned
+
+
+def travel_since_reversal(position: FloatArray, velocity: FloatArray, slow: float) -> FloatArray:
+    """Return how far an axis has moved since it last turned round (T,), a speed below `slow` being no direction of motion."""
+    moving = np.where(np.abs(velocity) > slow, np.sign(velocity), 0.0)
+    known = np.maximum.accumulate(np.where(moving != 0.0, np.arange(len(moving)), 0))
+    direction = moving[known]
+    turned = np.flatnonzero(np.diff(direction)) + 1
+    travel = np.empty_like(position)
+    for start, stop in itertools.pairwise([0, *turned, len(position)]):
+        # It turned where it was farthest back, up to where it was seen to move again.
+        before = max(start - 1, 0)
+        while before > 0 and moving[before] == 0.0:
+            before -= 1
+        ends = position[before : start + 1]
+        origin = ends.min() if direction[start] > 0.0 else ends.max()
+        travel[start:stop] = np.abs(position[start:stop] - origin)
+    return travel
 
 
 def _deviation(axis: AxisDescription, name: str, nominal: float) -> float:

@@ -68,7 +68,7 @@ class FoundLaw:
         names: instances that stay.
         withdrawn: instances whose name is withdrawn.
         counts: whether it is sure enough to be told. If not, it is a doubt about the names that it would withdraw.
-        alike: whether these names do most of what it does.
+        alike: whether the names that it would withdraw do most of what it does.
     """
 
     law: Law
@@ -259,7 +259,8 @@ class LawSearch:
         counts = sure and self._matters(problem, trial.law, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
         names, withdrawn = tuple(i for i in self.names if i not in dropped), dropped
-        alike = bool(dropped) and (scores[1] - scores[0]) / both < KEPT_PART
+        # What is surely better and yet a detail is the name and a detail beside it.
+        alike = bool(dropped) and ((scores[1] - scores[0]) / both < KEPT_PART or sure and not counts)
         if alike and counts:
             names, withdrawn = self.names, ()
         plain = {i.term: i for i in self.plain}

@@ -21,6 +21,7 @@ LARGEST_GROUPS = 3
 # What a further number must improve the fit by, in units of the squared deviation: 10 nats, odds of a few thousand to one.
 PRICE = 20.0
 SAMPLES = 200
+TRAVELS = 20  # lengths over which friction may build up that are tried at first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +127,7 @@ def closed_form(basis: Basis, weights: FloatArray, covariance: FloatArray) -> Cl
     if len(basis.knots) != 1:
         return None
     low, high = basis.knots[0][0], basis.knots[0][-1]
-    grid = np.linspace(low, high, SAMPLES)
+    grid = np.geomspace(low, high, SAMPLES) if basis.kind == "travel" else np.linspace(low, high, SAMPLES)
     functions = basis.functions([grid])
     inverse = np.asarray(np.linalg.pinv(functions, rcond=1e-9), dtype=np.float64)
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -154,7 +155,7 @@ def closed_form(basis: Basis, weights: FloatArray, covariance: FloatArray) -> Cl
             numbers = len(group) + len(group[0].inner)
             trials.append((misfit([*chosen, *group]) + PRICE * numbers, group))
         cost, group = min(trials, key=lambda trial: trial[0])
-        group = _refined(chosen, group, misfit, low, high)
+        group = _refined(basis, chosen, group, misfit)
         cost = misfit([*chosen, *group]) + PRICE * (len(group) + len(group[0].inner))
         if cost >= best:
             break
@@ -170,6 +171,8 @@ def _groups(basis: Basis, low: float, high: float) -> list[tuple[Atom, ...]]:
     """Functions to try, one group at a time."""
     if basis.kind == "periodic":
         return [(Atom(COS, (float(k),)), Atom(SIN, (float(k),))) for k in range(1, basis.harmonics + 1)]
+    if basis.kind == "travel":
+        return [(Atom(FADE, (float(part),)),) for part in np.geomspace(low, high, TRAVELS)]
     groups: list[tuple[Atom, ...]] = [(Atom(LINEAR),), (Atom(SQUARE),), (Atom(CUBE),)]
     if basis.kind == "speed":
         return [*groups, (Atom(DRAG),), (Atom(SIGN, (basis.width,)),)]
@@ -180,9 +183,10 @@ def _groups(basis: Basis, low: float, high: float) -> list[tuple[Atom, ...]]:
 
 
 def _refined(
-    chosen: Sequence[Atom], group: tuple[Atom, ...], misfit: Callable[[Sequence[Atom]], float], low: float, high: float
+    basis: Basis, chosen: Sequence[Atom], group: tuple[Atom, ...], misfit: Callable[[Sequence[Atom]], float]
 ) -> tuple[Atom, ...]:
     """Search the inner numbers of a group near where the grid has them."""
+    low, high = basis.knots[0][0], basis.knots[0][-1]
     if not group[0].inner or group[0].shape is SIGN or len({atom.inner for atom in group}) != 1:
         return group
     start = np.array(group[0].inner)
@@ -200,7 +204,7 @@ def _refined(
         span = high - low
         if group[0].shape in (STEP, BUMP) and not 0.02 * span < inner[1] < 2.0 * span:
             return np.inf
-        if group[0].shape is FADE and not 0.02 * span < inner[0] < 3.0 * span:
+        if group[0].shape is FADE and not (low if basis.kind == "travel" else 0.02 * span) < inner[0] < 3.0 * span:
             return np.inf
         return misfit([*chosen, *moved(step)])
 

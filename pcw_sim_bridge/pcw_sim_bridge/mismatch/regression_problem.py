@@ -152,6 +152,8 @@ class Term:
         arguments: names of the problem's variables that the contribution depends on.
         repeatable: several instances with different shapes may be at work at once (harmonics of a cogging).
         resolution: spacing of `shapes` per shaping parameter; local search stays within it.
+        least: values of shaping parameters below which they are not searched, by name: a wave of which little more than a
+            period was seen is any slow change.
         settled: shaping parameters that are as usual until the search has ended, and then where the model's slopes lead:
             spacing, least and largest value by name.
         blur: by how much shaping parameters are uncertain besides what noise does: standard deviations by name.
@@ -180,6 +182,7 @@ class Term:
     arguments: tuple[str, ...] = ()
     repeatable: bool = False
     resolution: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
+    least: Mapping[str, float] = dataclasses.field(default_factory=dict)
     settled: Mapping[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     blur: Mapping[str, float] = dataclasses.field(default_factory=dict)
     scan: Callable[[], FloatArray] | None = None
@@ -268,6 +271,8 @@ class Sites:
             `chassis_torque/z` in base_link, or `axis_force`.
         variables: what it may depend on: name -> (N,), at the rate at which the model is evaluated; names as those of
             `RegressionProblem.variables`.
+        angles: those of them that come round again after a turn.
+        slow: speed from which on the direction of a bench axis is sure.
         smoothing: speed over which the sign of a joint's speed reverses, as in the library's frictions [rad/s].
         columns: torques and forces (N, len(names), K) -> what they add to the residual (T, C, K).
     """
@@ -276,6 +281,8 @@ class Sites:
     variables: Mapping[str, FloatArray]
     smoothing: float
     columns: Callable[[FloatArray], FloatArray]
+    angles: tuple[str, ...] = ()
+    slow: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)

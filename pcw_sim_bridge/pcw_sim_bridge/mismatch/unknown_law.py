@@ -25,6 +25,8 @@ FLOOR_KNOTS = 5  # along each side of a map
 HARMONICS = 3
 SPOT_HARMONICS = 8  # of what is at one place of a wheel's turn
 ALIKE = 0.3  # part of the range over which a curve is taken to change
+TRAVEL = "travel_since_reversal"
+LEAST_TRAVEL = 2e-3  # of the farthest: friction that builds up over less is dry
 RARENESS = 4.0  # nats for every further variable, and for one of another joint
 RANGE_SAMPLES = 1000  # that the range of an argument is taken from
 # Below this part of the top speed a direction of motion means nothing.
@@ -66,7 +68,8 @@ class Basis:
     """Functions of one or two arguments.
 
     Attributes:
-        kind: "map" (piecewise linear between knots), "periodic" (a Fourier series) or "speed" (a map and a sign).
+        kind: "map" (piecewise linear between knots), "travel" (the same over the logarithm), "periodic" (a Fourier series) or
+            "speed" (a map and a sign).
         knots: of every argument.
         width: over which the sign of a "speed" reverses.
         harmonics: of a "periodic".
@@ -82,7 +85,10 @@ class Basis:
         if self.kind == "periodic":
             angles = arguments[0][:, None] * np.arange(1, self.harmonics + 1)
             return np.concatenate([np.ones((len(angles), 1)), np.cos(angles), np.sin(angles)], axis=1)
-        hats = [_hats(values, np.array(knots)) for values, knots in zip(arguments, self.knots, strict=True)]
+        hats = [
+            _hats(self._scale(values), self._scale(np.array(knots)))
+            for values, knots in zip(arguments, self.knots, strict=True)
+        ]
         columns = hats[0] if len(hats) == 1 else (hats[0][:, :, None] * hats[1][:, None, :]).reshape(len(hats[0]), -1)
         columns = columns @ self._smooth()
         if self.kind == "speed":
@@ -93,11 +99,15 @@ class Basis:
         """Root of the prior covariance of the values at the knots: neighbours are alike, as all of them may be large."""
         root: FloatArray = np.ones((1, 1))
         for knots in self.knots:
-            places = np.array(knots)
+            places = self._scale(np.array(knots))
             apart = (places[:, None] - places) / (places[-1] - places[0])
             covariance = 1.0 + np.exp(-0.5 * (apart / ALIKE) ** 2) + 1e-2 * np.eye(len(places))
             root = np.asarray(np.kron(root, np.linalg.cholesky(covariance)), dtype=np.float64)
         return root
+
+    def _scale(self, values: FloatArray) -> FloatArray:
+        """Values on the scale over which the functions are smooth."""
+        return np.log(np.maximum(values, 0.5 * self.knots[0][0])) if self.kind == "travel" else values
 
     def values_at_knots(self, weights: FloatArray) -> FloatArray:
         """Return the curve or map of weights (K,) at its knots, without the sign of a "speed"."""
@@ -222,6 +232,9 @@ def hypotheses(sites: Sites) -> list[Law]:
 
 def _basis(sites: Sites, places: Sequence[Place], kind: str) -> Basis | None:
     """Knots over the range of the arguments at all places; None where an argument hardly changes."""
+    if kind == "travel":
+        far = float(np.quantile(np.concatenate([combined(sites.variables, p.arguments[0]) for p in places]), 0.995))
+        return Basis(kind, (tuple(np.geomspace(LEAST_TRAVEL * far, far, KNOTS).tolist()),)) if far > 0.0 else None
     if kind in ("periodic", "spot"):
         turn = tuple(np.linspace(-np.pi, np.pi, 61).tolist())
         return Basis("periodic", (turn,), harmonics=SPOT_HARMONICS if kind == "spot" else HARMONICS)
@@ -252,7 +265,11 @@ def _all_places(sites: Sites) -> Iterator[tuple[tuple[Place, ...], tuple[str, ..
         for factor in (Factor(), dry, Factor("value", "velocity"), Factor("value", "force")):
             for name in variables:
                 if name != factor.variable:
-                    yield (Place("axis_force", factor, (((name, 1.0),),)),), _kinds(name)
+                    kinds = ("map", "spot") if name in sites.angles else _kinds(name)
+                    # What builds up over a way turns round at once, where a plain friction does so over a speed.
+                    sudden = name == TRAVEL and factor.kind == "sign"
+                    acting = Factor("sign", "velocity", min(sites.smoothing, sites.slow)) if sudden else factor
+                    yield (Place("axis_force", acting, (((name, 1.0),),)),), kinds
         return
     casters = [name.removeprefix("drive_torque/") for name in sites.names if name.startswith("drive_torque/")]
     shared = [name for name in ("time", "x", "y", "speed", "v_x", "v_y", "omega") if name in variables]
@@ -302,6 +319,8 @@ def _kinds(name: str) -> tuple[str, ...]:
         return ("periodic", "map")
     if name.startswith("drive_angle"):
         return ("periodic", "spot")
+    if name == TRAVEL:
+        return ("travel",)
     return ("speed",) if "velocity" in name or name in ("v_x", "v_y", "omega") else ("map",)
 
 
