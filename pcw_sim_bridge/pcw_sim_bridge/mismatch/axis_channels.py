@@ -491,7 +491,7 @@ class AxisProblemBuilder:
         return grid, "linear", float(grid[1] - grid[0])
 
     def _least_order(self, first: float) -> float:
-        """Below what no order is searched, the grid beginning at the first: that of a turn is one where most of a turn was seen."""
+        """Below what no order is searched: the first of the grid, or that of a turn where most of one was seen."""
         turns = float(np.ptp(self._variables["position"])) / (2.0 * np.pi)
         return min(first, 1.0) if self.axis.kind == "rotary" and turns > MOST_OF_A_TURN else first
 
