@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from pcw_sim_bridge.mismatch import explanation, open_set
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.explanation import Estimate, NamedTerm
 from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
-from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier
+from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier, plain_expression
 from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Sites, Term
 from pcw_sim_bridge.mismatch.report import write_report
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -500,6 +501,31 @@ def test_a_curve_that_has_a_closed_form_gets_it(function, basis, text):
     written = [atom.written("z") for atom in form.atoms]
     for expected in text:
         assert any(w.startswith(expected) for w in written), written
+
+
+@pytest.mark.parametrize(
+    ("function", "periodic", "text"),
+    [
+        (lambda z: -1.2 * z, False, "-1.2 omega"),
+        (lambda z: 0.3 * np.abs(z), False, "0.3 abs(omega)"),
+        (lambda z: 0.5 * z**2 + 0.01 * np.sin(9.0 * z), False, "0.5 omega**2"),
+        (lambda z: 0.2 * np.cos(z) - 0.1 * np.sin(z), True, "0.2 cos(omega) - 0.1 sin(omega)"),
+        (lambda z: np.sin(6.0 * z), False, None),
+        (np.zeros_like, False, None),
+    ],
+)
+def test_a_channel_that_is_no_torque_gets_a_plain_function_where_one_does(
+    function: Callable[[np.ndarray], np.ndarray], periodic: bool, text: str | None
+) -> None:
+    values = np.random.default_rng(0).uniform(-2.0, 2.0, 400)
+    found = plain_expression("omega", values, 0.7 + function(values), periodic)
+    if text is None:
+        assert found is None
+        return
+    assert found is not None
+    numbers = [re.findall(r"\d+\.?\d*", line) for line in (text, found)]
+    assert re.sub(r"\d+\.?\d*", "#", found) == re.sub(r"\d+\.?\d*", "#", text)
+    assert [float(number) for number in numbers[1]] == pytest.approx([float(number) for number in numbers[0]], rel=0.02)
 
 
 def test_a_law_that_a_later_answer_does_without_is_not_told_and_gives_the_name_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ constant, a wave number) are refined at every step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from scipy import optimize
@@ -21,6 +21,7 @@ LARGEST_GROUPS = 3
 # What a further number must improve the fit by, in units of the squared deviation: 10 nats, odds of a few thousand to one.
 PRICE = 20.0
 SAMPLES = 200
+ALIKE_ENOUGH = 0.97  # part of the square of a curve that a plain function of the same variable has to do
 TRAVELS = 20  # lengths over which friction may build up that are tried at first
 
 
@@ -100,6 +101,26 @@ class ClosedForm(Basis):
         low, high = self.knots[0][0], self.knots[0][-1]
         values = np.clip(arguments[0], low, high) if self.clipped else arguments[0]
         return np.stack([atom.values(values) for atom in self.atoms], axis=1)
+
+
+def plain_expression(name: str, values: FloatArray, curve: FloatArray, periodic: bool = False) -> str | None:
+    """Return a plain function that does nearly all that a curve does, such as "0.61 omega"; None where none does.
+
+    Args:
+        name: of the variable; values: its samples (N,), an angle if periodic.
+        curve: value of the curve at each of them (N,), up to a constant.
+    """
+    least = ALIKE_ENOUGH * float(np.sum((curve - curve.mean()) ** 2))
+    if least <= 0.0:
+        return None
+    plain = ((LINEAR,), (Shape("abs(z)", ""),), (SQUARE,), (DRAG,), (CUBE,), (LINEAR, SQUARE), (LINEAR, CUBE))
+    for shapes in ((Shape("cos(z)", ""), Shape("sin(z)", "")),) if periodic else plain:
+        columns = np.stack([Atom(shape).values(values) for shape in shapes], axis=1)
+        columns = columns - columns.mean(axis=0)
+        weights = np.linalg.lstsq(columns, curve - curve.mean(), rcond=1e-9)[0]
+        if np.sum((columns @ weights) ** 2) >= least:
+            return _summed(weights, [f" {Atom(shape).written(name)}" for shape in shapes])
+    return None
 
 
 def fourier(basis: Basis) -> ClosedForm:
@@ -221,12 +242,7 @@ def written(law: Law, weights: FloatArray) -> str | None:
         return None
     first = law.places[0]
     argument = _sum_of(first.arguments[0])
-    parts: list[str] = []
-    for weight, atom in zip(weights, law.basis.atoms, strict=True):
-        text = "" if atom.shape is ONE else f" {atom.written(argument)}"
-        sign = ("- " if weight < 0 else "+ ") if parts else ("-" if weight < 0 else "")
-        parts.append(f"{sign}{abs(weight):.4g}{text}")
-    size = " ".join(parts)
+    size = _summed(weights, ["" if atom.shape is ONE else f" {atom.written(argument)}" for atom in law.basis.atoms])
     forms = {"one": "{0}", "sign": "sign({1}) ({0})", "value": "{1} ({0})", "direction": "{1} / speed ({0})"}
     lines = []
     for place in law.places if law.sites[0].startswith("chassis") else (first,):
@@ -234,6 +250,15 @@ def written(law: Law, weights: FloatArray) -> str | None:
         form = forms.get(place.factor.kind, place.factor.kind + "({1}) ({0})")
         lines.append(f"{place.site} = {minus}{form.format(size, place.factor.variable)}")
     return "; ".join(lines)
+
+
+def _summed(weights: Iterable[float], functions: Iterable[str]) -> str:
+    """Write a sum of functions with their weights."""
+    parts: list[str] = []
+    for weight, text in zip(weights, functions, strict=True):
+        sign = ("- " if weight < 0 else "+ ") if parts else ("-" if weight < 0 else "")
+        parts.append(f"{sign}{abs(weight):.4g}{text}")
+    return " ".join(parts)
 
 
 def _sum_of(argument: Combination) -> str:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, optimize
@@ -23,7 +24,7 @@ from scipy import linalg, optimize
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
 from .law_search import LAW_MARGIN, FoundLaw, LawSearch, changes_law_of, gain_of_a_smaller_law
-from .leftover_expression import ClosedForm, closed_form, fourier, written
+from .leftover_expression import ClosedForm, closed_form, fourier, plain_expression, written
 from .noise_model import robust_deviation
 from .regression_problem import UNKNOWN, FloatArray, IntArray, RegressionProblem
 from .shape_search import refined_shape
@@ -67,7 +68,7 @@ class Leftover:
         gain: nats on held-out blocks.
         curve: the function, as (variable (N,), contribution (N,)) for the report.
         depends_on: all variables, the leading one first.
-        expression: closed form of the torque or force; None where there is only a curve.
+        expression: closed form of the torque or force, or of the channel; None where there is only a curve.
         law: what acts where; None for a dependence of a channel that is no torque or force.
         weights: of the law's basis (K,).
     """
@@ -444,6 +445,20 @@ def smooth_basis(values: FloatArray, periodic: bool) -> tuple[FloatArray, FloatA
     return (hats - hats.mean(axis=0))[:, hats.std(axis=0) > 1e-6], knots
 
 
+class _Dependence(NamedTuple):
+    """A function of one variable in one channel.
+
+    Attributes:
+        gain: on held-out blocks [nats]; share: part of what is left there that it explains.
+        curve: (variable (N,), contribution (N,)); expression: a plain function that does nearly the same.
+    """
+
+    gain: float
+    share: float
+    curve: tuple[FloatArray, FloatArray]
+    expression: str | None
+
+
 class OpenSetTest:
     """Tests the residual of a chosen set for dependences on the problem's variables."""
 
@@ -529,11 +544,14 @@ class OpenSetTest:
             smallest = max(smallest, ROUNDNESS * float(np.sqrt(np.mean(self.problem.variables["speed"][valid] ** 2))))
         for name in self._promising(channel):
             functions, knots = self.bases[channel, name]
-            gain, share, curve = self._dependence(channel, name, functions, knots, instances)
+            found = self._dependence(channel, name, functions, knots, instances)
+            gain, share = found.gain, found.share
             size = np.sqrt(share) * float(np.sqrt(np.mean(self.residual[valid, channel] ** 2)))
             passes = gain > threshold + LAW_MARGIN and share > SMALLEST_SHARE and size > smallest
             if passes and (best is None or gain > best.gain):
-                best = Leftover(self.problem.channels[channel].name, name, share, gain, curve)
+                left = self.problem.channels[channel].name
+                written = None if found.expression is None else f"{left} = {found.expression}"
+                best = Leftover(left, name, share, gain, found.curve, expression=written)
         return best
 
     def _promising(self, channel: int) -> list[str]:
@@ -555,27 +573,29 @@ class OpenSetTest:
 
     def _dependence(
         self, channel: int, name: str, functions: FloatArray, knots: FloatArray, instances: Sequence[Instance]
-    ) -> tuple[float, float, tuple[FloatArray, FloatArray]]:
-        """Held-out gain [nats] and share of a function of one variable in one channel, fitted beside the set."""
+    ) -> _Dependence:
+        """What a function of one variable in one channel does, fitted beside the set."""
         farthest = FARTHEST if self._far[channel] else np.inf
         augmented = AugmentedFit(self.regression, instances, channel, functions, farthest)
         before, after = augmented.held_out_errors()
         # Few samples and many functions leave less than noise does; held-out errors say how much less.
         scale = max(after / self.regression.effective_rows, 1.0)
         weights = augmented.weights()
+        periodic = name.startswith(("steer_angle", "drive_angle"))
         valid = self.problem.valid[:, channel]
         total = float(np.sum(self.residual[valid, channel] ** 2))
         errors = augmented.held_out_residuals(self.problem, self.search.block, channel)
         share = 1.0 - float(np.sum(errors[valid] ** 2)) / max(total, 1e-300)
         order = np.argsort(self.problem.variables[name])
-        if name.startswith(("steer_angle", "drive_angle")):
+        if periodic:
             grid = knots
             curve = smooth_basis(grid, periodic=True)[0] @ weights
         else:
             grid = np.linspace(knots[0], knots[-1], 61)
             shape = functions[order] @ weights
             curve = np.interp(grid, self.problem.variables[name][order], shape)
-        return 0.5 * (before - after) / scale, max(share, 0.0), (grid, curve)
+        words = plain_expression(name, self.problem.variables[name][valid], functions[valid] @ weights, periodic)
+        return _Dependence(0.5 * (before - after) / scale, max(share, 0.0), (grid, curve), words)
 
     def _vetoes(self, leftovers: Sequence[Leftover], threshold: float) -> list[tuple[Instance, str]]:
         """Instances that a leading dependence makes redundant and outdoes."""
