@@ -32,6 +32,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "acceleration": {"m/s^2": 1.0, "g": GRAVITY},
 }
 JOINT_QUANTITIES = {"position": "angle", "velocity": "angular speed", "effort": "torque"}
+COMMAND_QUANTITIES = {"commanded_velocity": "angular speed", "commanded_effort": "torque"}
 TRACKER_QUANTITIES = {"x": "length", "y": "length", "yaw": "angle"}
 IMU_QUANTITIES = {"yaw_rate": "angular speed", "acceleration_x": "acceleration", "acceleration_y": "acceleration"}
 
@@ -53,11 +54,13 @@ class ColumnSource:
 
 @dataclasses.dataclass(frozen=True)
 class JointColumns:
-    """One joint in `joint_states`."""
+    """One joint in `joint_states`, and what it was commanded in `joint_commands`."""
 
     position: ColumnSource | None = section("angle", default=None)
     velocity: ColumnSource | None = section("speed", default=None)
     effort: ColumnSource | None = section("torque, on the joint side of the gears", default=None)
+    commanded_velocity: ColumnSource | None = section("speed that it was told to have", default=None)
+    commanded_effort: ColumnSource | None = section("torque that it was told to give", default=None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,8 +108,11 @@ class ColumnMapping:
         for name, joint in self.joints.items():
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*_(steer|drive)", name):
                 raise DescriptionError(f"joints.{name}", name, "allowed: <caster>_steer or <caster>_drive")
-            if joint == JointColumns():
+            if all(getattr(joint, field) is None for field in JOINT_QUANTITIES):
                 raise DescriptionError(f"joints.{name}", {}, f"allowed: at least one of {', '.join(JOINT_QUANTITIES)}")
+        both = [field for field in COMMAND_QUANTITIES if any(getattr(joint, field) for joint in self.joints.values())]
+        if len(both) > 1:
+            raise DescriptionError("joints", " and ".join(both), "allowed: speeds or torques, never both")
         if (self.time is None) == (self.rate is None):
             found = None if self.time is None else "both"
             raise DescriptionError("time", found, "allowed: either a time column, or a rate in Hz")
@@ -124,7 +130,7 @@ class ColumnMapping:
         if self.time is not None:
             yield "time", "time", self.time
         for name, joint in self.joints.items():
-            for field, kind in JOINT_QUANTITIES.items():
+            for field, kind in (JOINT_QUANTITIES | COMMAND_QUANTITIES).items():
                 source = getattr(joint, field)
                 if source is not None:
                     yield f"joints.{name}.{field}", kind, source
@@ -179,7 +185,7 @@ def _written_out(owner: Any) -> Any:
     """The same with `x: 3` written as `x: {column: 3}`."""
     if not isinstance(owner, Mapping):
         return owner
-    plain = (*JOINT_QUANTITIES, *TRACKER_QUANTITIES, *IMU_QUANTITIES, "time")
+    plain = (*JOINT_QUANTITIES, *COMMAND_QUANTITIES, *TRACKER_QUANTITIES, *IMU_QUANTITIES, "time")
     return {
         key: {"column": value}
         if key in plain and isinstance(value, (str, int)) and not isinstance(value, bool)

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .column_mapping import (
+    COMMAND_QUANTITIES,
     DELIMITERS,
     IMU_QUANTITIES,
     JOINT_QUANTITIES,
@@ -156,6 +157,9 @@ def _write(
     """Write every row, as far as what belongs together in it was measured: a field of all joints, a pose, an IMU's reading."""
     names = list(mapping.joints)
     joints = [_together(signals, [f"joints.{name}.{field}" for name in names]) for field in JOINT_QUANTITIES]
+    # Not every joint is commanded: a message is about those that are.
+    commanded = {f: [n for n in names if f"joints.{n}.{f}" in signals] for f in COMMAND_QUANTITIES}
+    commands = [(own, _together(signals, [f"joints.{n}.{f}" for n in own])) for f, own in commanded.items() if own]
     pose = _together(signals, [f"tracker.{key}" for key in TRACKER_QUANTITIES])
     inertial = _together(signals, [f"imu.{key}" for key in IMU_QUANTITIES])
     for row in map(int, np.flatnonzero(stamped)):
@@ -163,6 +167,10 @@ def _write(
         position, velocity, effort = (_measured(values, row) for values in joints)
         if position is not None or velocity is not None or effort is not None:
             writer.write("/joint_states", joint_state(stamp, names, position, velocity, effort))
+        for told, values in commands:
+            if (wanted := _measured(values, row)) is not None:
+                speeds = wanted if commanded["commanded_velocity"] else None
+                writer.write("/joint_commands", joint_state(stamp, told, None, speeds, None if speeds is not None else wanted))
         place, sensed = _measured(pose, row), _measured(inertial, row)
         if place is not None and mapping.tracker is not None:
             frames = {"frame_id": mapping.tracker.frame, "child_frame_id": mapping.tracker.child_frame}

@@ -84,6 +84,23 @@ def test_columns_may_be_counted_and_stand_between_words(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.imu.acceleration[0], [0.0, 9.81, 9.81])
 
 
+@pytest.mark.parametrize(("field", "unit", "factor"), [("velocity", "rpm", math.tau / 60.0), ("effort", "mN m", 1e-3)])
+def test_what_was_commanded_is_imported_too(tmp_path: Path, field: str, unit: str, factor: float) -> None:
+    """Of the joints that were commanded; a cell without a number is a row without a command."""
+    lines = ["t,steer,drive,wanted"] + [f"{0.02 * k},0,{0.1 * k},{'' if k == 7 else 2 * k}" for k in range(80)]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    wanted = {f"commanded_{field}": {"column": "wanted", "unit": unit}}
+    joints = {"a_steer": {"position": "steer"}, "a_drive": {"position": "drive", **wanted}}
+    mapping = parse_column_mapping(changed(time="t", joints=joints, tracker=None))
+    counts, _ = import_columns(tmp_path / "log.csv", mapping, tmp_path / "bag")
+    assert counts == {"/joint_states": 80, "/joint_commands": 79}
+    commands = Recording.open(tmp_path / "bag").joint_commands
+    assert commands is not None and commands.joint_names == ("a_drive",)
+    expected = factor * 2.0 * np.delete(np.arange(80), 7)
+    np.testing.assert_allclose(getattr(commands["a_drive"], field), expected)
+    assert np.isnan(getattr(commands["a_drive"], "effort" if field == "velocity" else "velocity")).all()
+
+
 def test_a_counter_is_put_on_end_over_rows_without_it() -> None:
     true = np.array([-30.0, 10.0, 90.0, 150.0, 210.0, 330.0, 220.0, 100.0, -20.0])
     seen = np.mod(true, 256.0)
@@ -100,6 +117,13 @@ def test_a_counter_is_put_on_end_over_rows_without_it() -> None:
         (changed(joints={}), "joints: {} is not allowed"),
         (changed(joints={"front": {"position": 1}}), "joints.front: 'front' is not allowed; allowed: <caster>_steer"),
         (changed(joints={"a_steer": {}}), "joints.a_steer"),
+        (changed(joints={"a_steer": {"commanded_effort": 1}}), "joints.a_steer"),
+        (
+            changed(
+                joints={"a_steer": {"position": 1, "commanded_effort": 2}, "a_drive": {"position": 1, "commanded_velocity": 2}}
+            ),
+            "joints: 'commanded_velocity and commanded_effort' is not allowed; allowed: speeds or torques, never both",
+        ),
         (changed(joints={"a_steer": {"angle": 1}}), "joints.a_steer.angle"),
         (changed(joints={"a_steer": {"position": {"column": 1, "unit": "m"}}}), "joints.a_steer.position.unit: 'm'"),
         (changed(joints={"a_steer": {"position": {"column": -1}}}), "joints.a_steer.position.column: -1"),

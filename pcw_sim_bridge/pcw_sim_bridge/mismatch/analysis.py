@@ -127,12 +127,12 @@ def analyse(
     samples, channels = problem.residual.shape
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
 
-    def needs_no_explanation() -> tuple[CommandFindings, Prover]:
+    def needs_no_explanation() -> tuple[CommandFindings, Prover, tuple[str, ...]]:
         fitted, others = subject.command_problems(opened), subject.command_problems(held_out, searched=False)
         prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
-        return command_findings(fitted, others, seed, settings, progress), prover
+        return command_findings(fitted, others, seed, settings, progress), prover, subject.responses(opened)
 
-    explanation, (commands, prover) = side_by_side(
+    explanation, (commands, prover, responses) = side_by_side(
         lambda: explain(problem, np.random.default_rng(seed), settings, progress), needs_no_explanation
     )
     progress("proving it on held-out data")
@@ -176,7 +176,7 @@ def analyse(
             *_traces(problem, predicted(problem, explanation.fit), arguments, "fit"),
             *(_traces(other, proof.predicted, arguments, "holdout") if other is not None else ()),
         ),
-        notes=(*lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes),
+        notes=(*lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes, *responses),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),

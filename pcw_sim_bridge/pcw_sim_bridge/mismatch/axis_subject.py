@@ -123,6 +123,10 @@ class AxisSubject:
         """Return nothing: without what an axis needs its recording is not read."""
         return ()
 
+    def responses(self, opened: Sequence[Opened]) -> tuple[str, ...]:
+        """Return nothing: a bench records no commands."""
+        return ()
+
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
         """Return the windows to simulate."""
         assert self._cutoff is not None

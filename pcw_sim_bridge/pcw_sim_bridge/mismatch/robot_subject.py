@@ -41,6 +41,7 @@ from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_sq
 from .rolling_model import model_awaits_compiling
 from .rollout import Windows
 from .sensor_axes import unlike_axes
+from .speed_response import responses_in_words, speed_responses
 from .subject import Opened
 from .wheel_agreement import contradictions
 
@@ -190,6 +191,10 @@ class RobotSubject:
             )
             if not all(map(there, recordings))
         )
+
+    def responses(self, opened: Sequence[Opened]) -> tuple[str, ...]:
+        """Return how the joints follow commanded speeds, in words."""
+        return responses_in_words(speed_responses(self._seen_robot(), [o.recording for o in opened]))
 
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
         """Return the windows to simulate; None without torques, or for a robot that cannot be driven by them."""

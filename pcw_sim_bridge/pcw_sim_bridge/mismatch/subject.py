@@ -75,6 +75,9 @@ class Subject(Protocol):
     def absent(self, opened: Sequence[Opened]) -> tuple[tuple[str, str], ...]:
         """Return what was not recorded, and what that costs, in words."""
 
+    def responses(self, opened: Sequence[Opened]) -> tuple[str, ...]:
+        """Return how drives follow commanded speeds, in words; nothing where none were commanded."""
+
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
         """Return windows of the recordings to drive models of this subject over; None where that cannot be done."""
 
