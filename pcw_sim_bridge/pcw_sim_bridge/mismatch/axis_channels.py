@@ -362,8 +362,7 @@ class AxisProblemBuilder:
         variables = dict(self._variables)
         variables["time"] = time
         variables["force"] = self._filtered(self._smooth_forces)
-        travels = [travel_since_reversal(m.position, m.velocity, m.slow) for m in self.motions]
-        variables[TRAVEL] = self._filtered(travels)
+        variables[TRAVEL] = self._filtered(self._travels)
         terms = [self._term(effect, smoothing) for effect in candidate_effects()]
         return RegressionProblem(
             channels=(Channel("axis_force", axis.unit("N m"), axis="drive"),),
@@ -380,6 +379,10 @@ class AxisProblemBuilder:
             sites=self._sites(start, smoothing),
         )
 
+    @functools.cached_property
+    def _travels(self) -> list[FloatArray]:
+        return [travel_since_reversal(m.position, m.velocity, m.slow) for m in self.motions]
+
     def _sites(self, start: Mapping[int, float], smoothing: float) -> Sites:
         """The axis itself; `start` is the first instant of each recording [s]."""
         motions = self.motions
@@ -393,7 +396,7 @@ class AxisProblemBuilder:
         }
         variables["time"] = np.concatenate([m.time - start[m.recording] for m in motions])
         variables["force"] = np.concatenate(self._smooth_forces)
-        variables[TRAVEL] = np.concatenate([travel_since_reversal(m.position, m.velocity, m.slow) for m in motions])
+        variables[TRAVEL] = np.concatenate(self._travels)
         angles = ("position",) if self.axis.kind == "rotary" and np.ptp(variables["position"]) > 2.0 * np.pi else ()
         return Sites(("axis_force",), variables, smoothing, columns, angles, max(m.slow for m in motions))
 

@@ -730,27 +730,33 @@ def _p_values(search: EffectSearch, selection: Selection, result: OpenSetResult)
     """Probability per channel that noise and tolerances alone look like this.
 
     Where effects are named: chi-square of their whitened contribution in the channel. Where only a dependence is left:
-    of its gain. Elsewhere: of the largest gain that any further candidate reaches, against that of the surrogates.
+    of its gain. Elsewhere: of the largest gain that any further candidate reaches, against that of the surrogates, in the
+    channels that this one moves.
     """
     problem, regression, fit = search.problem, selection.regression, selection.fit
-    count = len(problem.nuisances)
-    effects = regression.design(fit.instances)[:, count:] @ fit.mean[count:] if fit.instances else None
-    further = regression.scan(fit.instances)[0]
-    gain = max((c.gain for c in further), default=0.0)
-    place, spread = search.noise_gain
-    idle = -math.expm1(-math.exp(min(-(gain - place) / spread, 50.0))) if math.isfinite(gain) else 1.0
+
+    def moved(instances: Sequence[Instance], first: int) -> FloatArray:
+        """Chi-square per channel (C,) of what the numbers of a set do from the first one of them on."""
+        does = regression.design(instances)[:, first:] @ regression.fit(instances).mean[first:]
+        return np.asarray(np.sum(regression.spread(does) ** 2, axis=0), dtype=np.float64)
+
     # A channel in which no sample can be judged says nothing.
-    seen = problem.valid.any(axis=0)
-    values = np.where(seen, min(1.0, max(idle, 0.0)), 1.0)
-    for channel in np.flatnonzero(seen):
+    values = np.ones(len(problem.channels))
+    best = max(regression.scan(fit.instances)[0], key=lambda candidate: candidate.gain, default=None)
+    if best is not None and math.isfinite(best.gain):
+        place, spread = search.noise_gain
+        idle = -math.expm1(-math.exp(min(-(best.gain - place) / spread, 50.0)))
+        statistics = moved((*fit.instances, best.instance), len(fit.mean))
+        nowhere = stats.chi2.sf(statistics, len(best.instance.active))
+        values = np.where(problem.valid.any(axis=0), np.clip(np.maximum(idle, nowhere), 0.0, 1.0), 1.0)
+    count = len(problem.nuisances)
+    effects, freedom = moved(fit.instances, count), len(fit.mean) - count
+    for channel, statistic in enumerate(effects):
         leftover = next(
             (left for left in result.leftovers if left.channel == problem.channels[channel].name), None
         )
         if leftover is not None:
             values[channel] = min(values[channel], float(stats.chi2.sf(2.0 * leftover.gain, 8)))
-        if effects is not None:
-            statistic = float(np.sum(regression.spread(effects)[:, channel] ** 2))
-            freedom = len(fit.mean) - count
-            if statistic > 2.0 * selection.threshold + freedom:
-                values[channel] = min(values[channel], float(stats.chi2.sf(statistic, freedom)))
+        if freedom and statistic > 2.0 * selection.threshold + freedom:
+            values[channel] = min(values[channel], float(stats.chi2.sf(statistic, freedom)))
     return values
