@@ -230,6 +230,9 @@ def test_the_smaller_one_of_two_wheels_that_never_steer_is_named(tmp_path: Path)
     estimate = analysis.findings.effects[0].parameters["error"]
     assert estimate.low < -0.01 < estimate.high
     assert not any(c.flagged for c in analysis.findings.channels if c.name.startswith("rolling_consistency"))
+    # A wheel that slips by as much on its way looks the same.
+    assert analysis.findings.effects[0].probability <= 0.5
+    assert any("slip in proportion to the motion" in note for note in analysis.findings.notes)
 
 
 @pytest.mark.parametrize("error", [0.05, 0.2])

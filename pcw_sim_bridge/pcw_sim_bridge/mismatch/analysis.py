@@ -17,9 +17,11 @@ from pcw_description.effects.registry import all_effects, also_known, get
 from .all_cores import side_by_side
 from .command_findings import CommandFindings, command_findings
 from .explanation import (
+    OF_ROLLING,
     OF_THE_BALANCE,
     Explanation,
     NamedTerm,
+    cannot_contradict,
     explain,
     explanation_by,
     strained_of_the_balance,
@@ -384,6 +386,12 @@ def _notes(
         if number.times > HEALTHY:
             far = f"{number.times:.1f} tolerances from the description"
             notes.append(f"{number.name} comes out {far}: check it or its tolerance.")
+    geometry = sorted({named.term.effect for named in explanation.named if named.term.effect in OF_ROLLING})
+    if geometry and cannot_contradict(problem):
+        notes.append(
+            f"Wheels of one axle that never steer cannot contradict each other: {', '.join(geometry)} may stand for a slip in "
+            "proportion to the motion, as of a robot that scrubs when it turns: half as sure."
+        )
     doubted = sorted({named.term.effect for named in explanation.named if named.term.effect in OF_THE_BALANCE})
     strained = strained_of_the_balance(problem, explanation.fit)
     if doubted and strained:

@@ -58,7 +58,9 @@ SAME = 0.9999
 # beside such numbers that no healthy robot has.
 OF_THE_BALANCE = ("payload_mass", "payload_offset", "torque_constant_error")
 NUMBERS_OF_THE_BALANCE = ("chassis.", "module.", "wheel.inertia", "rotors.", "torque_constant/")
-BELIEF_BESIDE_STRAINED = 0.5
+# Of wheels that cannot contradict each other these look like a slip in proportion to the motion.
+OF_ROLLING, CONSISTENCY = ("wheel_radius_error", "caster_offset_error"), "rolling_consistency/"
+HALF_AS_SURE = 0.5
 # An effect that hides behind a number leaves less than this part of its strain's square.
 RELIEF = 0.5
 
@@ -596,11 +598,18 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             )
         )
     doubted = _doubted_by_scale(named)
-    factor = BELIEF_BESIDE_STRAINED if strained_of_the_balance(problem, selection.fit) else 1.0
+    doubtful = set(OF_THE_BALANCE if strained_of_the_balance(problem, selection.fit) else ())
+    doubtful |= set(OF_ROLLING if cannot_contradict(problem) else ())
     return tuple(
-        dataclasses.replace(entry, probability=factor * entry.probability) if entry.term.effect in OF_THE_BALANCE else entry
+        dataclasses.replace(entry, probability=HALF_AS_SURE * entry.probability) if entry.term.effect in doubtful else entry
         for entry in doubted
     )
+
+
+def cannot_contradict(problem: RegressionProblem) -> bool:
+    """Whether wheels are redundant and yet say nothing of one another, as those of one axle that never turn."""
+    told = [problem.valid[:, c].any() for c, channel in enumerate(problem.channels) if channel.name.startswith(CONSISTENCY)]
+    return bool(told) and not any(told)
 
 
 def strained_of_the_balance(problem: RegressionProblem, fit: Fit) -> list[str]:
