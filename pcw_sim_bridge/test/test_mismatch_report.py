@@ -235,6 +235,16 @@ def test_a_doubted_effect_may_be_a_part_of_one_that_is_felt_there(other: str, ta
     assert f"It is x. (It may as well be {said}.)" in summary
 
 
+@pytest.mark.parametrize(
+    ("formula", "is_said"), [("gyro = -2 omega", True), ("gyro = " + "+ cos(omega) " * 12, False), (None, False)]
+)
+def test_a_formula_is_said_where_it_is_short(formula: str | None, is_said: bool) -> None:
+    left = UnknownFinding("gyro", ("omega",), formula, 0.9)
+    summary = "\n".join(minimal_findings("unexplained", unknown=(left,)).summary())
+    assert "Unknown: gyro depends on omega" in summary
+    assert (formula is not None and f"omega, {formula}." in summary) == is_said
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a report of `demo_findings`; not to be changed."""

@@ -15,6 +15,7 @@ Interval = tuple[float, float]
 FORMAT = "pcw_mismatch/1"
 VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
 REFUSED = "fitted but did not help held out"  # an outcome of the ladder
+SHORT_ENOUGH = 100  # characters of a formula that stands in a plain sentence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -415,7 +416,8 @@ class Findings:
         }[self.verdict]
         found = " ".join(effect.statement + self._doubt(effect) for effect in self.effects) or "none"
         for leftover in self.unknown:
-            found += f" Unknown: {leftover.channel} depends on {', '.join(leftover.depends_on)}."
+            plain = leftover.expression if leftover.expression and len(leftover.expression) <= SHORT_ENOUGH else ""
+            found += f" Unknown: {leftover.channel} depends on {', '.join(leftover.depends_on)}{plain and f', {plain}'}."
         if self.fit is None:
             fit = "no held-out data"
         else:
