@@ -158,8 +158,8 @@ def _write(
     names = list(mapping.joints)
     joints = [_together(signals, [f"joints.{name}.{field}" for name in names]) for field in JOINT_QUANTITIES]
     # Not every joint is commanded: a message is about those that are.
-    commanded = {f: [n for n in names if f"joints.{n}.{f}" in signals] for f in COMMAND_QUANTITIES}
-    commands = [(own, _together(signals, [f"joints.{n}.{f}" for n in own])) for f, own in commanded.items() if own]
+    told = {field: [name for name in names if f"joints.{name}.{field}" in signals] for field in COMMAND_QUANTITIES}
+    speeds, torques = (_together(signals, [f"joints.{name}.{field}" for name in own]) for field, own in told.items())
     pose = _together(signals, [f"tracker.{key}" for key in TRACKER_QUANTITIES])
     inertial = _together(signals, [f"imu.{key}" for key in IMU_QUANTITIES])
     for row in map(int, np.flatnonzero(stamped)):
@@ -167,10 +167,10 @@ def _write(
         position, velocity, effort = (_measured(values, row) for values in joints)
         if position is not None or velocity is not None or effort is not None:
             writer.write("/joint_states", joint_state(stamp, names, position, velocity, effort))
-        for told, values in commands:
-            if (wanted := _measured(values, row)) is not None:
-                speeds = wanted if commanded["commanded_velocity"] else None
-                writer.write("/joint_commands", joint_state(stamp, told, None, speeds, None if speeds is not None else wanted))
+        if (wanted := _measured(speeds, row)) is not None:
+            writer.write("/joint_commands", joint_state(stamp, told["commanded_velocity"], velocity=wanted))
+        if (wanted := _measured(torques, row)) is not None:
+            writer.write("/joint_commands", joint_state(stamp, told["commanded_effort"], effort=wanted))
         place, sensed = _measured(pose, row), _measured(inertial, row)
         if place is not None and mapping.tracker is not None:
             frames = {"frame_id": mapping.tracker.frame, "child_frame_id": mapping.tracker.child_frame}
@@ -181,8 +181,8 @@ def _write(
 
 
 def _together(signals: dict[str, FloatArray], keys: Sequence[str]) -> FloatArray | None:
-    """Signals (T, K) that make sense together alone; None if one of them is not mapped."""
-    return np.stack([signals[key] for key in keys], axis=1) if all(key in signals for key in keys) else None
+    """Signals (T, K) that make sense together alone; None if one of them is not mapped, or there are none."""
+    return np.stack([signals[key] for key in keys], axis=1) if keys and all(key in signals for key in keys) else None
 
 
 def _measured(values: FloatArray | None, row: int) -> FloatArray | None:

@@ -416,8 +416,10 @@ class Findings:
         }[self.verdict]
         found = " ".join(effect.statement + self._doubt(effect) for effect in self.effects) or "none"
         for leftover in self.unknown:
-            plain = leftover.expression if leftover.expression and len(leftover.expression) <= SHORT_ENOUGH else ""
-            found += f" Unknown: {leftover.channel} depends on {', '.join(leftover.depends_on)}{plain and f', {plain}'}."
+            told = [f"{leftover.channel} depends on {', '.join(leftover.depends_on)}"]
+            if leftover.expression and len(leftover.expression) <= SHORT_ENOUGH:
+                told.append(leftover.expression)
+            found += f" Unknown: {', '.join(told)}."
         if self.fit is None:
             fit = "no held-out data"
         else:

@@ -445,6 +445,11 @@ def smooth_basis(values: FloatArray, periodic: bool) -> tuple[FloatArray, FloatA
     return (hats - hats.mean(axis=0))[:, hats.std(axis=0) > 1e-6], knots
 
 
+def _is_angle(name: str) -> bool:
+    """Whether a variable comes round again after a turn."""
+    return name.startswith(("steer_angle", "drive_angle"))
+
+
 class _Dependence(NamedTuple):
     """A function of one variable in one channel.
 
@@ -486,7 +491,7 @@ class OpenSetTest:
         """Basis columns (T, K) and knots by channel and variable."""
         bases = {}
         for name, values in self.problem.variables.items():
-            functions, knots = smooth_basis(values, periodic=name.startswith(("steer_angle", "drive_angle")))
+            functions, knots = smooth_basis(values, _is_angle(name))
             if functions.shape[1]:
                 for channel in range(len(self.problem.channels)):
                     bases[channel, name] = (functions, knots)
@@ -549,9 +554,9 @@ class OpenSetTest:
             size = np.sqrt(share) * float(np.sqrt(np.mean(self.residual[valid, channel] ** 2)))
             passes = gain > threshold + LAW_MARGIN and share > SMALLEST_SHARE and size > smallest
             if passes and (best is None or gain > best.gain):
-                left = self.problem.channels[channel].name
-                written = None if found.expression is None else f"{left} = {found.expression}"
-                best = Leftover(left, name, share, gain, found.curve, expression=written)
+                own = self.problem.channels[channel].name
+                formula = None if found.expression is None else f"{own} = {found.expression}"
+                best = Leftover(own, name, share, gain, found.curve, expression=formula)
         return best
 
     def _promising(self, channel: int) -> list[str]:
@@ -581,21 +586,20 @@ class OpenSetTest:
         # Few samples and many functions leave less than noise does; held-out errors say how much less.
         scale = max(after / self.regression.effective_rows, 1.0)
         weights = augmented.weights()
-        periodic = name.startswith(("steer_angle", "drive_angle"))
         valid = self.problem.valid[:, channel]
         total = float(np.sum(self.residual[valid, channel] ** 2))
         errors = augmented.held_out_residuals(self.problem, self.search.block, channel)
         share = 1.0 - float(np.sum(errors[valid] ** 2)) / max(total, 1e-300)
         order = np.argsort(self.problem.variables[name])
-        if periodic:
+        if _is_angle(name):
             grid = knots
             curve = smooth_basis(grid, periodic=True)[0] @ weights
         else:
             grid = np.linspace(knots[0], knots[-1], 61)
             shape = functions[order] @ weights
             curve = np.interp(grid, self.problem.variables[name][order], shape)
-        words = plain_expression(name, self.problem.variables[name][valid], functions[valid] @ weights, periodic)
-        return _Dependence(0.5 * (before - after) / scale, max(share, 0.0), (grid, curve), words)
+        formula = plain_expression(name, self.problem.variables[name][valid], functions[valid] @ weights, _is_angle(name))
+        return _Dependence(0.5 * (before - after) / scale, max(share, 0.0), (grid, curve), formula)
 
     def _vetoes(self, leftovers: Sequence[Leftover], threshold: float) -> list[tuple[Instance, str]]:
         """Instances that a leading dependence makes redundant and outdoes."""

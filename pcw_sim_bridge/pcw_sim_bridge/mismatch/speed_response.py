@@ -23,7 +23,6 @@ from .regression_problem import FloatArray
 
 LARGEST_STEP = 2e-3  # [s] at which commands are held and filtered
 SHORTEST_PIECE, LEAST_TIME = 1.0, 5.0  # [s] on end, and in all
-LONGEST = 300.0  # [s] of which more is not looked at
 # A pause of so many intervals, or of so long [s], ends a piece; so long a command is held.
 PAUSE_INTERVALS, PAUSE = 5.0, 0.1
 TIME_CONSTANTS = (0.0, *np.geomspace(2e-3, 2.0, 16).tolist())  # [s]
@@ -135,7 +134,7 @@ def _pieces(recording: Recording, i: int, k: int) -> list[_Piece]:
     for rows in np.split(np.arange(len(time)), np.flatnonzero(broken)[1:]):
         if not held[rows[0]] or time[rows[-1]] - time[rows[0]] < SHORTEST_PIECE:
             continue
-        grid = np.arange(time[rows[0]], min(time[rows[-1]], time[rows[0]] + LONGEST) + step, step)
+        grid = np.arange(time[rows[0]], time[rows[-1]] + step, step)
         now = np.maximum(np.searchsorted(stamp, grid, side="right") - 1, 0)
         found.append(_Piece(step, wanted[now], time[rows] - grid[0], speed[rows]))
     return found
@@ -192,7 +191,7 @@ def _fitted(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, float | N
 
 
 def _lag(piece: _Piece, constant: float) -> FloatArray:
-    """The command after a lag (F,), which begins at rest with it."""
+    """The command after a lag (F,), the first one having been held for long."""
     if constant <= 0.0:
         return piece.command
     kept = float(np.exp(-piece.step / constant))
@@ -201,7 +200,7 @@ def _lag(piece: _Piece, constant: float) -> FloatArray:
 
 
 def _looped(piece: _Piece, bandwidth: float) -> FloatArray:
-    """The command after a loop with both poles at a bandwidth, at the times of the speeds (T,)."""
+    """The command after a loop with both poles at a bandwidth, likewise, at the times of the speeds (T,)."""
     above, below = signal.bilinear([2.0 * bandwidth, bandwidth**2], [1.0, 2.0 * bandwidth, bandwidth**2], 1.0 / piece.step)
     start = signal.lfilter_zi(above, below) * piece.command[0]
     answer = signal.lfilter(above, below, piece.command, zi=start)[0]
