@@ -18,7 +18,6 @@ import random
 import secrets
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -53,6 +52,7 @@ RECORDED = (
     "cmd_vel", "joint_commands", "joint_states", "imu/data", "odom", "ground_truth/odom", "slip/encoder", "/diagnostics",
 )
 ANALYSIS_DEADLINE = 600.0  # [s]
+LONGEST_LINE = 150  # characters of its progress that are shown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -241,10 +241,15 @@ def analyse(out: Path, robot: Path, recording: Path, holdout: Path) -> dict[str,
                 "--out", str(report), "--holdout", str(holdout),
             ],
         )
-        try:
-            code = analyser.process.wait(timeout=ANALYSIS_DEADLINE)
-        except subprocess.TimeoutExpired:
-            raise ProcessError(f"the analyser still runs after {ANALYSIS_DEADLINE:g} s ({analyser.log})") from None
+        begun, told = time.monotonic(), 0
+        while (code := analyser.process.poll()) is None:
+            if time.monotonic() - begun > ANALYSIS_DEADLINE:
+                raise ProcessError(f"the analyser still runs after {ANALYSIS_DEADLINE:g} s ({analyser.log})")
+            lines = [line for line in analyser.log.read_text(errors="replace").splitlines() if line.startswith("[")]
+            for line in lines[told:]:
+                say(f"analysis: {line[:LONGEST_LINE]}")
+            told = len(lines)
+            time.sleep(0.2)
         if code != 0:
             raise ProcessError(f"the analyser ended with code {code} ({analyser.log}):\n{analyser.last_lines()}")
     content: dict[str, Any] = json.loads((report / "report.json").read_text(encoding="utf-8"))

@@ -274,7 +274,8 @@ def read_axis_recording(path: str | Path, axis: AxisDescription) -> AxisRecordin
     """
     path = Path(path)
     if not path.is_file():
-        raise AxisRecordingError(f"{path}: no such file")
+        what = "it is a folder; allowed for a bench axis: a file" if path.is_dir() else "no such file"
+        raise AxisRecordingError(f"{path}: {what}")
     table = _open_table(path)
     signals = {}
     for signal, column in axis.columns.items():

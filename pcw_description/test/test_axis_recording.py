@@ -88,6 +88,14 @@ def test_a_file_that_cannot_be_used_is_an_error(tmp_path: Path, content: np.ndar
     assert "run.csv" in str(caught.value)
 
 
+def test_a_folder_and_nothing_at_all_are_told_apart(tmp_path: Path) -> None:
+    """A recording of a robot is a folder; here a file is wanted."""
+    with pytest.raises(AxisRecordingError, match="it is a folder; allowed for a bench axis: a file"):
+        read_axis_recording(tmp_path, servo())
+    with pytest.raises(AxisRecordingError, match="no such file"):
+        read_axis_recording(tmp_path / "run.csv", servo())
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
