@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .description_fields import parsed_file, quantity, read_section, section, text
+from .description_fields import parsed_file, quantity, read_provenance, read_section, section, text
 from .effect_instance import EffectInstance
 from .effects.registry import read_physics
 from .errors import DescriptionError, PcwError, nearest_name
@@ -203,12 +203,7 @@ def parse_axis_description(data: Mapping[str, Any]) -> AxisDescription:
     if kind not in KINDS:
         raise DescriptionError("kind", kind, f"allowed: {', '.join(KINDS)}")
     content["columns"] = _read_columns(content.get("columns"), kind)
-    provenance = content.get("provenance")
-    if not isinstance(provenance, Mapping) or not provenance:
-        raise DescriptionError(
-            "provenance", provenance, "allowed: a mapping that says where each number comes from"
-        )
-    content["provenance"] = {str(name): str(source) for name, source in provenance.items()}
+    content["provenance"] = read_provenance(content.get("provenance"))
     content["tolerances"] = read_tolerances(content.get("tolerances") or {}, DEFAULT_TOLERANCES[kind])
     content["physics"] = read_physics(content.get("physics") or [], (TARGET,))
     axis: AxisDescription = read_section(AxisDescription, content, "")

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from .description_fields import parsed_file, quantity, read_section, section, text
+from .description_fields import parsed_file, quantity, read_provenance, read_section, section, text
 from .errors import DescriptionError
 from .robot_description import GRAVITY
 
@@ -153,10 +153,7 @@ def parse_column_mapping(data: Mapping[str, Any]) -> ColumnMapping:
     content = dict(data)
     if content.get("format") != FORMAT:
         raise DescriptionError("format", content.get("format"), f"allowed: {FORMAT}")
-    provenance = content.get("provenance")
-    if not isinstance(provenance, Mapping) or not provenance:
-        raise DescriptionError("provenance", provenance, "allowed: a mapping that says where each number comes from")
-    content["provenance"] = {str(name): str(source) for name, source in provenance.items()}
+    content["provenance"] = read_provenance(content.get("provenance"))
     joints = content.get("joints")
     if not isinstance(joints, Mapping):
         raise DescriptionError("joints", joints, "allowed: a mapping of joints to their columns")

@@ -7,6 +7,7 @@ printed documentation of a format all come from it.
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import math
 import re
 import types
@@ -175,6 +176,23 @@ def read_section(cls: type[Any], data: object, key: str) -> Any:
             continue
         values[name] = _read_value(data[name], where, field, hints[name])
     return cls(**values)
+
+
+def read_provenance(provenance: object) -> dict[str, str]:
+    """Return where the numbers of a file come from, by what they describe; a text is the provenance of all.
+
+    Raises:
+        DescriptionError: missing, empty, or a source that is no text.
+    """
+    if isinstance(provenance, str) and provenance.strip():
+        return {"all": provenance}
+    if not isinstance(provenance, Mapping) or not provenance:
+        allowed = "allowed: where each number comes from, its source or 'assumed' with the reason, as a text or a mapping"
+        raise DescriptionError("provenance", provenance, allowed)
+    for name, source in provenance.items():
+        if not isinstance(source, (str, datetime.date)) or not str(source).strip():  # YAML makes a date of 2026-05-04
+            raise DescriptionError(f"provenance.{name}", source, "allowed: text, a source or 'assumed' with the reason")
+    return {str(name): str(source) for name, source in provenance.items()}
 
 
 def _read_value(value: object, where: str, field: dataclasses.Field[Any], hint: Any) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from .contact.contact_model import tyre_parameters
-from .description_fields import parsed_file, read_section
+from .description_fields import parsed_file, read_provenance, read_section
 from .effects.registry import read_physics
 from .errors import DescriptionError, nearest_name
 from .robot_description import DEFAULT_TOLERANCES, FORMAT, Caster, FixedWheel, RobotDescription, Tolerance
@@ -81,7 +81,7 @@ def parse_robot(data: Mapping[str, Any]) -> RobotDescription:
     content["fixed_wheels"] = tuple(
         read_section(FixedWheel, item, f"fixed_wheels[{index}]") for index, item in enumerate(fixed_wheels)
     )
-    content["provenance"] = _read_provenance(content.get("provenance"))
+    content["provenance"] = read_provenance(content.get("provenance"))
     tolerances, physics = content.get("tolerances"), content.get("physics")
     content["tolerances"] = {} if tolerances is None else read_tolerances(tolerances, DEFAULT_TOLERANCES)
     names = [caster.name for caster in content["casters"]]
@@ -104,16 +104,6 @@ def _check_shape(owner: Mapping[str, Any], where: str) -> None:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
-
-
-def _read_provenance(provenance: object) -> dict[str, str]:
-    allowed = "allowed: a mapping that says where each number comes from, its source or 'assumed' with the reason"
-    if not isinstance(provenance, Mapping) or not provenance:
-        raise DescriptionError("provenance", provenance, allowed)
-    for name, source in provenance.items():
-        if not isinstance(source, str) or not source.strip():
-            raise DescriptionError(f"provenance.{name}", source, "allowed: text, a source or 'assumed' with the reason")
-    return {str(name): source for name, source in provenance.items()}
 
 
 def _merged(defaults: Mapping[str, Any], own: object, where: str) -> dict[str, Any]:

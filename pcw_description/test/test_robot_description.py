@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import datetime
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -157,11 +158,17 @@ MISTAKES = [
     ("shape is a list", "contact/shape", [1.0], ["contact.shape", "[1.0]", "a mapping of names to finite numbers"]),
     ("no provenance", "provenance", REMOVED, ["provenance is missing", "where each number comes from"]),
     ("empty provenance", "provenance", {}, ["provenance", "{}", "where each number comes from"]),
-    ("provenance as text", "provenance", "CAD", ["provenance", "'CAD'", "a mapping"]),
+    ("provenance of blanks", "provenance", " ", ["provenance", "' '", "a text or a mapping"]),
     ("provenance without source", "provenance/chassis", None,
      ["provenance.chassis is missing", "text, a source or 'assumed'"]),
     ("provenance is a number", "provenance/chassis", 3, ["provenance.chassis", "3", "text, a source or 'assumed'"]),
 ]
+
+
+def test_a_text_is_the_provenance_of_all_numbers() -> None:
+    assert parse_robot(changed("provenance", "measured on a scale")).provenance == {"all": "measured on a scale"}
+    dated = parse_robot(changed("provenance", {"chassis": datetime.date(2026, 5, 4)}))
+    assert dated.provenance == {"chassis": "2026-05-04"}
 
 
 @pytest.mark.parametrize(("path", "value", "words"), [case[1:] for case in MISTAKES], ids=[case[0] for case in MISTAKES])
