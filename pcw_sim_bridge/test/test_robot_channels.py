@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from pcw_description.contact.contact_model import LENGTH, slip_under_load, tyre_
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
+from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
@@ -539,6 +541,16 @@ def test_a_cogging_turns_with_the_wheel_and_not_with_what_is_read_of_it(tmp_path
     assert problem.with_headings({"steer_zero/rear_left": 1e-3, "steer_zero/rear_right": 0.02}).terms[place].columns(
         dict(size.shape)
     ) == pytest.approx(problem.columns(place, size.shape))
+
+
+def test_an_order_is_searched_as_far_as_its_own_joint_leaves_it_open(tmp_path: Path) -> None:
+    """By drives that turn fifty times as far as a steering, its spring of order 1 stayed two coggings of 1.03 and 1.06."""
+    recording = record(tmp_path, THESIS, 9)
+    travel = np.ptp(recording.joint_states.position, axis=0)
+    for term in RobotProblemBuilder(THESIS, [recording]).build().terms:
+        if term.effect == "motor_cogging":
+            turned = max(travel[THESIS.caster_index(name), AXIS_NAMES.index(str(term.axis))] for name in term.target)
+            assert term.resolution["order"] == ("linear", pytest.approx(0.25 * math.tau / turned, rel=0.2))
 
 
 def test_an_imu_that_reads_too_much_reads_too_much_of_a_leaning_floor_too(tmp_path: Path) -> None:

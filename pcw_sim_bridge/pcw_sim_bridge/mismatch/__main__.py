@@ -40,6 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, SystemError) as error:
         if not _interrupted(error):
             raise
+        # What was cut off while it was made cannot be taken down in order, which is of no interest any more.
+        sys.unraisablehook = lambda _: None
         print(f"mismatch: interrupted; {options.interrupted}", file=sys.stderr)
         return 130
 

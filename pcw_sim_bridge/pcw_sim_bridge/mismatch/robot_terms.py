@@ -133,6 +133,7 @@ class _TermMaker:
             )
         arguments = [_ARGUMENT_NAMES[argument] for argument in kernel_arguments(effect.name)]
         orders = [shape[p.name] for shape in shapes for p in effect.nonlinear_parameters if p.unit == "1/rad"]
+        searched = [p for p in effect.nonlinear_parameters if p.default is None]
 
         def headed(changes: Mapping[str, float]) -> Columns | None:
             turned = [changes.get(f"steer_zero/{name}", 0.0) for name in target]
@@ -149,7 +150,7 @@ class _TermMaker:
             shapes=shapes,
             columns=_once_more(shapes[0], first, columns),
             arguments=tuple(f"{axis or effect.axis}_{argument}/{name}" for argument in arguments for name in target),
-            resolution={p.name: _spacing(p, self.looked) for p in effect.nonlinear_parameters if p.default is None},
+            resolution={p.name: self._spacing(p, target, axis or effect.axis) for p in searched},
             repeatable=among > 0,
             grid_size=among,
             is_exact=True,
@@ -219,6 +220,12 @@ class _TermMaker:
     def _width(self, i: int, axis: int) -> float:
         """How far two orders may differ that a joint does not tell apart [1/rad]."""
         return math.tau / max(float(np.ptp(self.looked.angle[:, i, axis])), 1e-9)
+
+    def _spacing(self, parameter: EffectParameter, target: Sequence[str], axis: str) -> tuple[str, float]:
+        """Spacing of the grid of a shaping parameter; of an order, a quarter of what the joint that turned farthest tells."""
+        if parameter.unit != "1/rad":
+            return "log", 2.15
+        return "linear", 0.25 * min(self._width(self.robot.caster_index(name), AXIS_NAMES.index(axis)) for name in target)
 
     def _orders(self, i: int, axis: int) -> Chosen:
         """Orders of the ripples that a torque at one joint would have to have, to be in what is left."""
@@ -449,13 +456,6 @@ def _look_of(effect: Effect) -> str:
         if shaping <= names:
             return look
     return "patches" if isinstance(effect, ContactEffect) and {"x", "y", "length", "width"} <= names else ""
-
-
-def _spacing(parameter: EffectParameter, looked: Looked) -> tuple[str, float]:
-    """Spacing of the grid of a shaping parameter."""
-    if parameter.unit == "1/rad":
-        return "linear", math.pi / (2.0 * max(float(np.ptp(looked.angle.reshape(len(looked.angle), -1), axis=0).max()), 1.0))
-    return "log", 2.15
 
 
 def _heights(effect: Effect) -> dict[str, tuple[float, float, float]]:
