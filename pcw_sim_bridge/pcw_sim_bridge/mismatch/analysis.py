@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from .findings import (
 )
 from .found_effect import effect_instance
 from .generated_effect import NoSuchKernelError, generate
+from .late_torques import TORQUE_LAG, with_late_torques
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
@@ -129,14 +130,15 @@ def analyse(
     samples, channels = problem.residual.shape
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
 
-    def needs_no_explanation() -> tuple[CommandFindings, Prover, tuple[str, ...]]:
+    def needs_no_explanation() -> tuple[CommandFindings, Sequence[RegressionProblem], Prover, tuple[str, ...]]:
         fitted, others = subject.command_problems(opened), subject.command_problems(held_out, searched=False)
         prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
-        return command_findings(fitted, others, seed, settings, progress), prover, subject.responses(opened)
+        return command_findings(fitted, others, seed, settings, progress), fitted, prover, subject.responses(opened)
 
-    explanation, (commands, prover, responses) = side_by_side(
+    explanation, (commands, commanded, prover, responses) = side_by_side(
         lambda: explain(problem, np.random.default_rng(seed), settings, progress), needs_no_explanation
     )
+    commands = with_late_torques(commands, commanded, explanation)
     progress("proving it on held-out data")
     proof = prover.prove(explanation, bool(commands.named))
     explanation = proof.explanation
@@ -178,7 +180,10 @@ def analyse(
             *_traces(problem, predicted(problem, explanation.fit), arguments, "fit"),
             *(_traces(other, proof.predicted, arguments, "holdout") if other is not None else ()),
         ),
-        notes=(*lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit), *commands.notes, *responses),
+        notes=(
+            *lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit, commands.numbers),
+            *commands.notes, *responses,
+        ),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),
@@ -365,14 +370,26 @@ def _residual_map(explanation: Explanation, path: FloatArray | None) -> Residual
     return ResidualMap(sides[0], sides[1], _on_end(problem), variables, path)
 
 
+def _far_off(number: RetunedFinding) -> str:
+    """Say of a number that no healthy system has it; of one that no description holds, what it means."""
+    far = f"{number.name} comes out {number.times:.1f} tolerances"
+    late = f"{1e3 * abs(number.value):.2g} ms {'later' if number.value < 0.0 else 'earlier'}"
+    if number.name == TORQUE_LAG:
+        return f"{far} off: torques act {late} than joint_states report them. The fit allows for it."
+    if number.name == "heading_lead":
+        return f"{far} off: wheels follow their headings {late} than rigid ones do. The fit allows for it."
+    return f"{far} from the description: check it or its tolerance."
+
+
 def _notes(
     explanation: Explanation,
     retuned: Sequence[RetunedFinding],
     has_holdout: bool,
     proof: Proof,
     recordings: Sequence[Path],
+    told: Collection[str],
 ) -> tuple[str, ...]:
-    """What a reader has to know to judge the findings."""
+    """What a reader has to know to judge the findings; of some numbers they say it themselves."""
     notes = list(proof.notes)
     problem, unfinished = explanation.search.problem, bool(explanation.leftovers)
     for label, variable in explanation.withdrawn:
@@ -382,10 +399,7 @@ def _notes(
     for named in explanation.named:
         if named.term.recording is not None:
             notes.append(f"{named.term.effect} was at work in one recording alone: {recordings[named.term.recording]}.")
-    for number in retuned:
-        if number.times > HEALTHY:
-            far = f"{number.times:.1f} tolerances from the description"
-            notes.append(f"{number.name} comes out {far}: check it or its tolerance.")
+    notes += [_far_off(number) for number in retuned if number.times > HEALTHY and number.name not in told]
     geometry = sorted({named.term.effect for named in explanation.named if named.term.effect in OF_ROLLING})
     if geometry and cannot_contradict(problem):
         notes.append(

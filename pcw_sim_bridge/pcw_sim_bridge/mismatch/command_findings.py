@@ -45,6 +45,7 @@ class CommandFindings:
         named: effects between commands and torques, each with what it is in a description.
         proofs: held-out errors of every channel.
         notes: what a reader has to know to judge them.
+        numbers: re-tuned ones of the motion that they explain, by name.
     """
 
     channels: tuple[ChannelFinding, ...] = ()
@@ -54,6 +55,7 @@ class CommandFindings:
     proofs: tuple[ChannelProof, ...] = ()
     ladder: tuple[LadderFinding, ...] = ()
     notes: tuple[str, ...] = ()
+    numbers: tuple[str, ...] = ()
 
 
 def command_findings(
@@ -94,7 +96,7 @@ def command_findings(
         )
         found = CommandFindings(
             (*found.channels, finding),
-            (*found.named, *(_with_instance(named) for named in (explanation.named if explanation else ()))),
+            (*found.named, *(with_instance(named) for named in (explanation.named if explanation else ()))),
             (*found.leftovers, *(explanation.leftovers if explanation else ())),
             (*found.locations, *(_location(problem, named) for named in (explanation.named if explanation else ()))),
             (*found.proofs, proof),
@@ -194,7 +196,7 @@ def _shared(found: CommandFindings, problems: Sequence[RegressionProblem]) -> Co
             where = dataclasses.replace(
                 places[0], casters=tuple(joints), channels=tuple(name for place in places for name in place.channels)
             )
-            named = [_with_instance(pooled), *(entry for k, entry in enumerate(named) if k not in own)]
+            named = [with_instance(pooled), *(entry for k, entry in enumerate(named) if k not in own)]
             locations = [where, *(place for k, place in enumerate(locations) if k not in own)]
             if others:
                 notes.append(
@@ -281,7 +283,8 @@ def _proof(problem: RegressionProblem, added: FloatArray, floor: float, rng: np.
     return ChannelProof(problem.channels[0].name, floor / spread, before, after, first, last)
 
 
-def _with_instance(named: NamedTerm) -> tuple[NamedTerm, EffectInstance]:
+def with_instance(named: NamedTerm) -> tuple[NamedTerm, EffectInstance]:
+    """Return a finding and what it is in a description."""
     values = {name: estimate.value for name, estimate in named.estimates.items()}
     return named, effect_instance(named.term.effect, named.term.target, values, named.term.axis)
 

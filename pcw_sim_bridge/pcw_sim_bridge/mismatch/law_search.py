@@ -318,7 +318,9 @@ class LawSearch:
             guessed = True
         # Slips are the model's guess, unless they do what no slow error of its torques and tyres does.
         settings, alone = self.search.settings, not self.names and not any(site.startswith("chassis") for site in law.sites)
-        least = settings.least_peculiar_unlike if alone else settings.least_peculiar
+        # What a tyre does that is another than the model's goes with the forces on it, which are those of both motors.
+        unlike = alone and not any("torque/" in name and name not in law.sites for name in law.depends_on)
+        least = settings.least_peculiar_unlike if unlike else settings.least_peculiar
         return (guessed or alone) and self.search.whiten_at(left).peculiar(change) > least
 
 

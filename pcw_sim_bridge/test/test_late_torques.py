@@ -1,0 +1,72 @@
+"""Drives that report their commands: what they make of them shows in the motion alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pcw_description import load_robot
+from pcw_description.effect_instance import EffectInstance
+from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
+from pcw_sim_bridge.mismatch.command_findings import CommandFindings, command_findings
+from pcw_sim_bridge.mismatch.command_tracking import command_problems
+from pcw_sim_bridge.mismatch.explanation import explain
+from pcw_sim_bridge.mismatch.held_commands import held_commands
+from pcw_sim_bridge.mismatch.late_torques import TORQUE_LAG, with_late_torques
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+
+ROBOT = load_robot("thesis")
+DELAY = 0.008
+
+
+def silent(message: str) -> None:
+    """Tell nobody."""
+
+
+@pytest.fixture(scope="module")
+def echoed():
+    """A recording of drives with a dead time that report what they are asked for, and what its motion says."""
+    effects = [EffectInstance("actuator_delay", ROBOT.caster_names, {"delay": DELAY}, axis) for axis in ("drive", "steer")]
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), effects)
+    noise = 0.01 * np.random.default_rng(1).standard_normal(recording.joint_states.effort.shape)
+    effort = np.nan_to_num(held_commands(ROBOT, recording)) + noise
+    recording = dataclasses.replace(recording, joint_states=dataclasses.replace(recording.joint_states, effort=effort))
+    explanation = explain(RobotProblemBuilder(ROBOT, [recording]).build(), np.random.default_rng(0))
+    return command_problems(ROBOT, [recording]), explanation
+
+
+def test_a_dead_time_behind_reports_that_are_the_commands_is_found(echoed):
+    """The verdict was that nothing is missing; `torque_lag` alone was off by so many tolerances."""
+    problems, explanation = echoed
+    between = command_findings(problems, (), 0, None, silent)
+    assert not between.named
+    found = with_late_torques(between, problems, explanation)
+    assert [(named.term.effect, instance.axis) for named, instance in found.named] == [
+        ("actuator_delay", "drive"), ("actuator_delay", "steer"),
+    ]  # fmt: skip
+    for named, instance in found.named:
+        assert instance.target == ROBOT.caster_names
+        assert named.estimates["delay"].low < DELAY < named.estimates["delay"].high < 1.3 * DELAY
+        assert named.ambiguous_with == ("actuator_lag",)
+    assert [place.axis for place in found.locations] == ["drive", "steer"]
+    assert found.numbers == (TORQUE_LAG,)
+    assert "are the commands" in found.notes[-1]
+
+
+def test_nothing_is_named_where_torques_are_late_by_what_cycles_make(echoed):
+    problems, explanation = echoed
+    index = [number.name for number in explanation.search.problem.nuisances].index(TORQUE_LAG)
+    mean = explanation.fit.mean.copy()
+    mean[index] = -1.5 / problems[0].rate
+    fit = dataclasses.replace(explanation.fit, mean=mean)
+    selection = dataclasses.replace(explanation.selection, fit=fit)
+    prompt = dataclasses.replace(explanation, selection=selection)
+    assert prompt.fit.mean[index] == mean[index]
+    assert with_late_torques(CommandFindings(), problems, prompt) == CommandFindings()
+
+
+def test_nothing_is_named_where_reports_are_no_commands_or_some_are_missing(echoed):
+    problems, explanation = echoed
+    measured = [dataclasses.replace(p, residual=p.residual + 0.5 * p.measured) for p in problems]
+    for others in (measured, problems[1:], ()):
+        assert with_late_torques(CommandFindings(), others, explanation) == CommandFindings()
