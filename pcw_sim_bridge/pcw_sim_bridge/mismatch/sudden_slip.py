@@ -15,10 +15,14 @@ USUAL_DURATION = 3.0  # [s]; what stays for half of it is the usual difference
 MEDIAN_RATE = 25.0  # [Hz]; of faster samples about so many are enough for a median of seconds
 SUDDEN = 6.0  # times what the difference usually departs from that, as the standard deviation of its quiet part
 MEDIAN_OF_NORMAL = 0.6745  # of the absolute value of a standard normal number
+# Wheels spin where they and the tracker part by so much of their speed: no number of a description is so wrong. Where they do
+# so nearly all the time, one of the two is read wrongly; they have to agree to a part of it now and then.
+SPINNING, AGREEING, AT_TIMES = 0.5, 0.1, 0.1
+OFTEN = 0.25  # of the time; what comes more seldom does not make the usual departure larger, and is told by it
 
 
 def sudden_slip(tracked: FloatArray, rolled: FloatArray, rate: float, reach: float, least: FloatArray) -> BoolArray:
-    """Samples (T,) at which the tracked twist departs from that of the wheels more than it usually does.
+    """Samples (T,) at which the tracked twist departs from that of the wheels more than it usually does, or by half of it.
 
     Args:
         tracked, rolled: twists (T, 3); NaN in `tracked` where nothing was tracked.
@@ -28,11 +32,24 @@ def sudden_slip(tracked: FloatArray, rolled: FloatArray, rate: float, reach: flo
     """
     known: BoolArray = np.asarray(np.isfinite(tracked).all(axis=1))
     apart = np.where(known[:, None], tracked - rolled, 0.0)
-    departure = apart - _usually(apart, rate)
-    size = np.hypot(departure[:, 0], departure[:, 1]) + reach * np.abs(departure[:, 2])
+    size = _speed(apart - _usually(apart, rate), reach)
     usual = float(np.median(size[known])) / MEDIAN_OF_NORMAL if known.any() else 0.0
     found: BoolArray = known & (size > np.maximum(least, SUDDEN * usual))
-    return found
+    return found | _spinning(_speed(apart, reach), _speed(rolled, reach), known, least)
+
+
+def _speed(twist: FloatArray, reach: float) -> FloatArray:
+    """Size (T,) of twists (T, 3) [m/s]."""
+    speed: FloatArray = np.hypot(twist[:, 0], twist[:, 1]) + reach * np.abs(twist[:, 2])
+    return speed
+
+
+def _spinning(apart: FloatArray, rolled: FloatArray, known: BoolArray, least: FloatArray) -> BoolArray:
+    """Samples (T,) at which the robot hardly moves as its wheels roll, however long; see `sudden_slip`."""
+    moving = known & (rolled > least)
+    agreeing, spinning = moving & (apart < AGREEING * rolled), moving & (apart > SPINNING * rolled)
+    shares = [np.count_nonzero(rows) / max(np.count_nonzero(moving), 1) for rows in (agreeing, spinning)]
+    return spinning if shares[0] > AT_TIMES and shares[1] > OFTEN else np.zeros_like(known)
 
 
 def _usually(apart: FloatArray, rate: float) -> FloatArray:
