@@ -16,7 +16,7 @@ NODE = "pcw_bringup_scripts.nodes.manoeuvre"
 
 
 class PlayedBridge:
-    """Publishes /clock 10 ms apart while it is not paused."""
+    """Publishes /clock 20 ms apart while it is not paused."""
 
     def __init__(self, ros):
         self.ros, self.time_ns, self.asked = ros, 0, []
@@ -31,7 +31,7 @@ class PlayedBridge:
 
     def tick(self):
         if self.asked and not self.asked[-1]:
-            self.time_ns += 10_000_000
+            self.time_ns += 20_000_000
             self.clock.publish(Clock(clock=ns_to_stamp(self.time_ns)))
 
 
