@@ -114,6 +114,12 @@ def analyse(
         progress(told)
     progress("building the channels")
     problem = subject.problem(opened)
+    known = [*opened, *held_out]
+    right = subject.put_right(problem, known)
+    if right is not known:
+        opened, held_out = right[: len(opened)], right[len(opened) :]
+        progress(f"{', '.join(one.finding.path for one in right)}: {right[0].finding.warnings[-1]}")
+        problem = subject.problem(opened)
     inputs = tuple(o.finding for o in (*opened, *held_out))
     judged = problem.valid.any(axis=1)
     usable = float(judged.sum()) / problem.rate

@@ -66,6 +66,10 @@ class AxisSubject:
         self._cutoff = builder.cutoff
         return builder.build(self._smoothing)
 
+    def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
+        """Return the recordings as they are: their description says in which units."""
+        return opened
+
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what returns the problem: all candidates of one channel are made in no time."""
         problem = self.problem(opened)

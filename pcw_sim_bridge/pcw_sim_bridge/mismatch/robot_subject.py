@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import math
@@ -43,6 +44,7 @@ from .rollout import Windows
 from .sensor_axes import unlike_axes
 from .speed_response import responses_in_words, speed_responses
 from .subject import Opened
+from .torque_units import torque_units
 from .wheel_agreement import contradictions
 
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
@@ -128,6 +130,21 @@ class RobotSubject:
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem."""
         return self._builder(opened).build()
+
+    def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
+        """Return recordings with torques at the joints; where they are in unknown units, as they are, with a warning."""
+        found = torque_units(self._seen_robot(), problem)
+        if found is None:
+            return opened
+        right = []
+        for one in opened:
+            recording = one.recording
+            if found.is_known:
+                recording = copy.copy(recording)
+                recording.joint_states, recording.joint_commands = found.put_right(self._seen_robot(), recording)
+            warnings = (*one.finding.warnings, found.warning)
+            right.append(Opened(recording, dataclasses.replace(one.finding, warnings=warnings)))
+        return right
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes it of the candidates of some keys alone."""

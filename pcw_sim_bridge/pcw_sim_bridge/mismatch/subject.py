@@ -46,6 +46,9 @@ class Subject(Protocol):
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem of recordings; later calls keep the filters that the first one chose."""
 
+    def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
+        """Return recordings in the units that a description asks for, told by their problem; the same if they are."""
+
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes the same of the candidates of some keys alone, none of which is made before."""
 

@@ -48,8 +48,8 @@ def _spinning(apart: FloatArray, rolled: FloatArray, known: BoolArray, least: Fl
     """Samples (T,) at which the robot hardly moves as its wheels roll, however long; see `sudden_slip`."""
     moving = known & (rolled > least)
     agreeing, spinning = moving & (apart < AGREEING * rolled), moving & (apart > SPINNING * rolled)
-    shares = [np.count_nonzero(rows) / max(np.count_nonzero(moving), 1) for rows in (agreeing, spinning)]
-    return spinning if shares[0] > AT_TIMES and shares[1] > OFTEN else np.zeros_like(known)
+    often = float(moving.sum())
+    return spinning if agreeing.sum() > AT_TIMES * often and spinning.sum() > OFTEN * often else np.zeros_like(known)
 
 
 def _usually(apart: FloatArray, rate: float) -> FloatArray:
