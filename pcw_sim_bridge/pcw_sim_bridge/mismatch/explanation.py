@@ -61,6 +61,8 @@ NUMBERS_OF_THE_BALANCE = ("chassis.", "module.", "wheel.inertia", "rotors.", "to
 # Of wheels that cannot contradict each other these look like a slip in proportion to the motion.
 OF_ROLLING, CONSISTENCY = ("wheel_radius_error", "caster_offset_error"), "rolling_consistency/"
 HALF_AS_SURE = 0.5
+# No effect does what these do.
+HIDES_NOTHING = ("heading_lead",)
 # An effect that hides behind a number leaves less than this part of its strain's square.
 RELIEF = 0.5
 
@@ -234,7 +236,10 @@ def search_effects(
     selection = search.run()
     strains = _strains(search.problem, selection.fit)
     loose = {number.name for number in problem.nuisances if number.loose}
-    strained = {name: strain for name, strain in strains.items() if strain > (LOOSE_STRAINED if name in loose else STRAINED)}
+    strained = {
+        name: strain for name, strain in strains.items()
+        if name not in HIDES_NOTHING and strain > (LOOSE_STRAINED if name in loose else STRAINED)
+    }  # fmt: skip
     if not strained:
         return search, selection
     progress(f"once more with narrower tolerances of {', '.join(strained)}")

@@ -30,7 +30,9 @@ INERTIAS = ("module.", "wheel.inertia", "rotors.")  # of numbers in whose place 
 FLOOR = ("ground.slope.x", "ground.slope.y")
 # [rad/s]; of the velocity loops of drives, and the largest part of their torque that their reports may lack.
 LOOP_BANDWIDTH, LARGEST_UNREPORTED = 50.0, 0.3
-CONTACT_TIME = 5e-3  # [s]; what a soft constraint takes to hold a wheel that its heading leads aside
+# Numbers of tyres, and how late a wheel follows its heading, which is the later the more its contact yields: most of all in
+# other simulations, by soft constraints.
+LOOSE = ("contact.", "heading_lead")
 FREQUENCY_DEVIATION = 0.2  # of the chassis on its springs, relative
 
 
@@ -66,7 +68,7 @@ def robot_nuisances(
     found = [
         Nuisance(
             n.label, n.unit, n.nominal, math.hypot(n.deviation, _misjudged(n, column, differences)), column, n.changes,
-            loose=n.label.startswith("contact."),
+            loose=n.label.startswith(LOOSE),
         )
         for n, column in zip(varied, columns, strict=True)
     ]
@@ -88,8 +90,7 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
     layout = differences.model.layout
     sampling = max(motion.sampling for motion in differences.motions)
     # Nobody knows either which headings a simulation took its rates from, or how a drive makes its angles from its counts.
-    # And a wheel follows its heading the later the more its contact yields, most of all in other simulations.
-    found.append(VariedNumber("heading_lead", "s", 0.0, math.hypot(0.5 * sampling, CONTACT_TIME), _entry("heading_lead")))
+    found.append(VariedNumber("heading_lead", "s", 0.0, 0.5 * sampling, _entry("heading_lead")))
     if layout.balanced:
         # A drive reports the torque of some instant within its own cycle; nobody knows which.
         found.append(VariedNumber("torque_lag", "s", 0.0, sampling, _entry("torque_lag")))
