@@ -38,8 +38,8 @@ def on_its_wheels(robot):
 
 def wanted_twist(t):
     """Changing along all three axes, from rest."""
-    grown = min(t, 1.0)
-    return grown * np.array([0.5 * math.sin(1.1 * t) + 0.2 * math.sin(4.1 * t), 0.5 * math.sin(0.8 * t + 1.0), math.sin(0.6 * t)])
+    along = 0.5 * math.sin(1.1 * t) + 0.2 * math.sin(4.1 * t)
+    return min(t, 1.0) * np.array([along, 0.5 * math.sin(0.8 * t + 1.0), math.sin(0.6 * t)])
 
 
 def recorded(robot, friction, seed=0):

@@ -18,7 +18,7 @@ from pcw_sim_bridge.mismatch import rolling_cases
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.robot_motion import base_pose
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.sudden_slip import sudden_slip
+from pcw_sim_bridge.mismatch.sudden_slip import spinning, sudden_slip
 
 RECORDINGS = Path(__file__).parents[1] / "config" / "recordings"
 # In the recording with the published numbers: the steering of this robot stands so far from its counter's zero.
@@ -266,15 +266,18 @@ def test_the_pose_of_base_link_follows_from_what_is_tracked() -> None:
 
 def test_a_robot_that_spins_its_wheels_most_of_the_time_is_no_usual_one_and_a_wrong_axis_is_no_slip() -> None:
     """On ice for twelve seconds of eighteen all wheels agreed, and their way was that of the robot."""
-    rate, time = 50.0, np.arange(0.0, 18.0, 0.02)
+    time = np.arange(0.0, 18.0, 0.02)
     rolled = np.zeros((len(time), 3))
     rolled[:, 1] = 0.5 * np.sin(2.0 * time)
     least = np.full(len(time), 0.1)
     on_ice = time > 6.0
     tracked = np.where(on_ice[:, None], 0.02 * rolled, rolled)
     fast = np.abs(rolled[:, 1]) > 0.1
-    np.testing.assert_array_equal(sudden_slip(tracked, rolled, rate, 0.3, least), on_ice & fast)
-    assert not sudden_slip(-rolled, rolled, rate, 0.3, least).any()
+    np.testing.assert_array_equal(spinning(tracked, rolled, 0.3, least), on_ice & fast)
+    tracked[:50] = np.nan
+    assert not spinning(tracked, rolled, 0.3, least)[:50].any()
+    assert not spinning(np.where(on_ice[:, None], -rolled, rolled), rolled, 0.3, least).any()
+    assert not spinning(0.02 * rolled, rolled, 0.3, least).any()
 
 
 def test_what_comes_and_goes_in_a_moment_is_sudden_and_a_wrong_number_is_not() -> None:

@@ -50,7 +50,7 @@ from .robot_nuisances import (
 from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
 from .signal_filter import SignalFilter
-from .sudden_slip import sudden_slip
+from .sudden_slip import spinning, sudden_slip
 from .torque_errors import INSTRUMENTS, with_balanced_torques
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
@@ -407,6 +407,7 @@ def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -
         bad: BoolArray = np.max(np.linalg.norm(contradiction, axis=2), axis=1) > allowed
         # Wheels that spin all together do not contradict each other.
         bad |= sudden_slip(tracked, rolled, motion.rate, reach, GROSS * allowed)
+        bad |= spinning(tracked, rolled, reach, GROSS * allowed)
         turned = np.column_stack([twist[:, :2], motion.imu[:, 0]])
         bad |= sudden_slip(turned, twist, motion.rate, reach, GROSS * allowed)
     else:
