@@ -318,8 +318,7 @@ class LawSearch:
             guessed = True
         # Slips are the model's guess, unless they do what no slow error of its torques and tyres does.
         settings, alone = self.search.settings, not self.names and not any(site.startswith("chassis") for site in law.sites)
-        # What a tyre does that is another than the model's goes with the forces on it, which are those of both motors.
-        unlike = alone and not any("torque/" in name and name not in law.sites for name in law.depends_on)
+        unlike = alone and not _is_of_others(law)
         least = settings.least_peculiar_unlike if unlike else settings.least_peculiar
         return (guessed or alone) and self.search.whiten_at(left).peculiar(change) > least
 
@@ -337,6 +336,15 @@ def _is_fast(law: Law) -> bool:
     own = {place.site.replace("torque", "velocity") for place in law.places}
     names = {name for place in law.places for argument in place.arguments for name, _ in argument}
     return bool(own & names) and all(place.factor == Factor() for place in law.places)
+
+
+def _is_of_others(law: Law) -> bool:
+    """Whether a law goes with torques or speeds of other joints than its own.
+
+    So does what a tyre or a body does that is another than the model's: forces and slips of a wheel are those of both motors.
+    """
+    moving = [name for name in law.depends_on if "torque/" in name or "velocity/" in name]
+    return any(name.replace("velocity/", "torque/") not in law.sites for name in moving)
 
 
 def changes_law_of(law: Law, term: Term) -> bool:
