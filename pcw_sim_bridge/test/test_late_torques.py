@@ -70,3 +70,16 @@ def test_nothing_is_named_where_reports_are_no_commands_or_some_are_missing(echo
     measured = [dataclasses.replace(p, residual=p.residual + 0.5 * p.measured) for p in problems]
     for others in (measured, problems[1:], ()):
         assert with_late_torques(CommandFindings(), others, explanation) == CommandFindings()
+
+
+def test_of_a_drive_that_is_described_as_late_such_reports_say_nothing():
+    """Else the patched description would miss what its own patch holds."""
+    late = {"delay": DELAY}
+    instances = tuple(EffectInstance("actuator_delay", ROBOT.caster_names, late, axis) for axis in ("drive", "steer"))
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 10.0, 3), instances)
+    patched = dataclasses.replace(ROBOT, physics=instances)
+    assert len(command_problems(patched, [recording])) == 2 * ROBOT.n
+    effort = np.nan_to_num(held_commands(ROBOT, recording))
+    echoed = dataclasses.replace(recording, joint_states=dataclasses.replace(recording.joint_states, effort=effort))
+    assert command_problems(patched, [echoed]) == []
+    assert len(command_problems(ROBOT, [echoed])) == 2 * ROBOT.n

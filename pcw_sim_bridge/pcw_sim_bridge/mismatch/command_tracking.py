@@ -42,6 +42,7 @@ SHORTEST = 1.0  # [s]
 # Nobody knows how long a command was on its way within its own cycle: this part of a cycle either way.
 LATENCY_PART = 0.1
 PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
+NEARER = 0.5  # in squares
 TIME_SPACING = 1.3
 TIMES = tuple(1e-3 * TIME_SPACING**k for k in range(18))  # [s], of lags and dead times
 # A dead time shows once it reaches into the last step of a cycle, or of one before, and as far as that step only in proportion
@@ -155,12 +156,15 @@ def command_problems(
 ) -> list[RegressionProblem]:
     """Return one problem per joint with commands, in the order of the joints.
 
+    Of a drive that is described as late or limited, and reports its commands all the same, reports say nothing.
+
     Args:
         robot: the nominal robot; recordings: opened with it.
         searched: False: the candidates get no numbers to try.
     """
     pieces = commanded_joints(robot, recordings)
-    return [_JointProblem(robot, i, axis, own).problem(searched) for (i, axis), own in sorted(pieces.items())]
+    joints = [_JointProblem(robot, i, axis, own) for (i, axis), own in sorted(pieces.items())]
+    return [joint.problem(searched) for joint in joints if not joint.reports_commands]
 
 
 class _JointProblem:
@@ -177,6 +181,13 @@ class _JointProblem:
         self._known = sorted(known, key=lambda instance: get(instance.name).stage)  # type: ignore[attr-defined]
         self._plain = self._torques(())
         self._measured = np.concatenate([piece.torque for piece in pieces])
+
+    @property
+    def reports_commands(self) -> bool:
+        """Whether the reports are nearer to the commands than to what the described effects make of them."""
+        asked = np.concatenate([piece.command for piece in self.pieces])
+        left = [float(np.sum((self._measured - torque) ** 2)) for torque in (asked, self._plain)]
+        return left[0] < NEARER * left[1]
 
     def _torques(self, more: Sequence[EffectInstance]) -> FloatArray:
         """Torque of all pieces on end (T,) with the robot's own effects and more of them, each in its stage."""
