@@ -9,7 +9,7 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.command_findings import CommandFindings, command_findings
-from pcw_sim_bridge.mismatch.command_tracking import command_problems
+from pcw_sim_bridge.mismatch.command_tracking import command_problems, joints_that_report_commands
 from pcw_sim_bridge.mismatch.explanation import explain
 from pcw_sim_bridge.mismatch.held_commands import held_commands
 from pcw_sim_bridge.mismatch.late_torques import TORQUE_LAG, with_late_torques
@@ -82,4 +82,6 @@ def test_of_a_drive_that_is_described_as_late_such_reports_say_nothing():
     effort = np.nan_to_num(held_commands(ROBOT, recording))
     echoed = dataclasses.replace(recording, joint_states=dataclasses.replace(recording.joint_states, effort=effort))
     assert command_problems(patched, [echoed]) == []
+    assert joints_that_report_commands(patched, [echoed]) == list(ROBOT.joint_names)
+    assert joints_that_report_commands(patched, [recording]) == []
     assert len(command_problems(ROBOT, [echoed])) == 2 * ROBOT.n

@@ -162,9 +162,17 @@ def command_problems(
         robot: the nominal robot; recordings: opened with it.
         searched: False: the candidates get no numbers to try.
     """
+    return [joint.problem(searched) for joint in _joints(robot, recordings) if not joint.reports_commands]
+
+
+def joints_that_report_commands(robot: RobotDescription, recordings: Sequence[Recording]) -> list[str]:
+    """Return the joints whose drives are described as late or limited, and report their commands all the same."""
+    return [f"{joint.caster}_{joint.axis}" for joint in _joints(robot, recordings) if joint.reports_commands]
+
+
+def _joints(robot: RobotDescription, recordings: Sequence[Recording]) -> list[_JointProblem]:
     pieces = commanded_joints(robot, recordings)
-    joints = [_JointProblem(robot, i, axis, own) for (i, axis), own in sorted(pieces.items())]
-    return [joint.problem(searched) for joint in joints if not joint.reports_commands]
+    return [_JointProblem(robot, i, axis, own) for (i, axis), own in sorted(pieces.items())]
 
 
 class _JointProblem:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.kinds import ActuatorEffect
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
 from pcw_description.robot_description import (
@@ -26,7 +27,7 @@ from pcw_description.robot_description import (
 )
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
-from .command_tracking import command_problems
+from .command_tracking import command_problems, joints_that_report_commands
 from .errors import MismatchError
 from .even_stamps import EvenStamps
 from .findings import InputFinding
@@ -198,7 +199,11 @@ class RobotSubject:
         recordings = [o.recording for o in opened]
         cannot = "forces, friction and masses cannot be judged, nor simulated"
         casters = tuple((f"caster {name}", f"{cannot}, and its wheel is not seen") for name in self._missing)
-        return casters + tuple(
+        known = any(isinstance(get(instance.name), ActuatorEffect) for instance in self.robot.physics)
+        echoed = joints_that_report_commands(self._seen_robot(), recordings) if known else []
+        reports = "their drives report the commands: whether they are as late or limited as described is not seen"
+        told = ((f"torques of {', '.join(echoed)}", reports),) if echoed else ()
+        return casters + told + tuple(
             (sensor, cost)
             for sensor, there, cost in (
                 ("effort in joint_states", _has_effort, cannot),
