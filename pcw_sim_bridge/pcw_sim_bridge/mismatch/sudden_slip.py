@@ -1,7 +1,8 @@
 """Moments at which wheels and tracker part suddenly: where no wheel says that another one slips, or all slip together.
 
 A wrong number of the description parts them slowly, as the robot turns and changes its speed. What comes within a moment
-and is gone again is no number: a wheel spun, a counter lost its place, the tracker saw something else.
+and is gone again is no number: a wheel spun, a counter lost its place, the tracker saw something else. Nor is what leaves a
+robot nearly where it is while all its wheels roll, however long it lasts (`spinning`).
 """
 
 from __future__ import annotations
