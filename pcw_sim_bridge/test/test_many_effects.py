@@ -1,10 +1,12 @@
-"""A robot that seems to have everything at once has another description, more likely than not."""
+"""A robot that seems to have everything at once has another description, likely; what leaves a gap is not all."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 from pcw_description.effect_instance import EffectInstance
-from pcw_sim_bridge.mismatch.analysis import MOST_AT_ONCE, doubted_in_a_crowd
+from pcw_sim_bridge.mismatch.analysis import MOST_AT_ONCE, doubted_in_a_crowd, doubted_in_a_gap
 from pcw_sim_bridge.mismatch.explanation import NamedTerm
 from pcw_sim_bridge.mismatch.regression_problem import Term
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -32,3 +34,19 @@ def test_many_of_the_same_kinds_are_no_crowd() -> None:
     kept, notes = doubted_in_a_crowd(entries)
     assert [entry.probability for entry, _ in kept] == [0.9] * len(entries)
     assert notes == ()
+
+
+def test_what_leaves_most_of_the_gap_is_half_as_sure() -> None:
+    """Wheels that scrub without yielding passed, at a probability of 1, for gears that lose six sevenths of their torque."""
+    entries = [named(KINDS[0], "left")]
+    doubted, notes = doubted_in_a_gap(entries, 0.41)
+    assert doubted[0][0].probability == pytest.approx(0.45)
+    assert len(notes) == 1 and "41 % of the gap" in notes[0]
+    for closed in (0.0, 0.6, 1.0):
+        assert doubted_in_a_gap(entries, closed) == (entries, ())
+
+
+def test_what_is_at_work_once_need_not_close_the_gap_of_another_recording() -> None:
+    entry, instance = named("external_push", "left")
+    once = dataclasses.replace(entry, term=dataclasses.replace(entry.term, once=True))
+    assert doubted_in_a_gap([(once, instance)], 0.2) == ([(once, instance)], ())

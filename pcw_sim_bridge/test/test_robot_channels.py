@@ -17,9 +17,10 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES
+from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
+from pcw_sim_bridge.mismatch.regression_problem import SizedTerm, term_key
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, sliding, used_friction
 from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
 from pcw_sim_bridge.mismatch.rolling_model import (
@@ -703,3 +704,22 @@ def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path, healthy: Re
         left[name] = [np.sqrt(np.mean(residual[problem.valid[:, 0] & rows, 0] ** 2)) for rows in (~second, second)]
     assert left["with"][0] == pytest.approx(left["without"][0])
     assert left["with"][1] < 0.5 * left["without"][1]
+
+
+def test_steerings_that_rub_leave_tyres_off_the_peak_of_their_friction():
+    """As forces of the ground their torques would use up its friction, and six samples of ten not be judged."""
+    rubbing = EffectInstance("steer_coulomb_friction", THESIS.caster_names, {"coulomb": 4.5})
+    recording = simulate(World(THESIS, THESIS, "reduced"), Run("run", "identification", 15.0, 3), [rubbing])
+    problem = RobotProblemBuilder(THESIS, [recording]).build(keys={term_key(rubbing.name, rubbing.target, None, None)})
+    assert np.mean(problem.valid[:, 0]) > 0.8
+    # With it in the description they are the ground's, and as far from the peak.
+    described = dataclasses.replace(THESIS, physics=(rubbing,))
+    told = RobotProblemBuilder(described, [dataclasses.replace(recording, robot=described)]).build(with_terms=False)
+    assert np.mean(told.valid[:, 0]) > 0.8
+    # Up to the peak slips are those of the curves' slopes: what the effect takes away is all in proportion to it.
+    [term] = problem.terms
+    column = term.columns(term.shapes[0])[:, :, 0]
+    exact, _ = problem.exact({}, [SizedTerm(0, term.shapes[0], np.array([4.5, 0.0]), (0,))])
+    here = problem.valid[:, 0]
+    assert np.linalg.norm((problem.residual - 4.5 * column - exact)[here]) < 0.02 * np.linalg.norm(problem.residual[here])
+    assert np.linalg.norm(exact[here, :3]) < 0.1 * np.linalg.norm(problem.residual[here, :3])

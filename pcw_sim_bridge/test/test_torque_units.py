@@ -10,7 +10,7 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.regression_problem import term_key
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.torque_units import torque_units
+from pcw_sim_bridge.mismatch.torque_units import FRICTIONS, torque_units
 
 THESIS, TIDYBOT = load_robot("thesis"), load_robot("tidybot2")
 
@@ -29,6 +29,7 @@ def found(robot, recording, factor=1.0):
     joints = recording.joint_states
     recording = dataclasses.replace(recording, joint_states=dataclasses.replace(joints, effort=joints.effort * factor))
     keys = {term_key("torque_constant_error", robot.caster_names, axis, None) for axis in ("drive", "steer")}
+    keys |= {term_key(name, robot.caster_names, None, None) for name in FRICTIONS}
     return torque_units(robot, RobotProblemBuilder(robot, [recording]).build(keys=keys)), recording
 
 
@@ -68,6 +69,12 @@ def test_weak_motors_and_heavy_loads_are_no_units(plain):
     assert found(THESIS, plain, 0.5)[0] is None
     heavy = recorded(THESIS, [EffectInstance("payload_mass", ("chassis",), {"mass": 60.0, "x": 0.1, "y": 0.0, "z": 0.4})])
     assert found(THESIS, heavy)[0] is None
+
+
+def test_steerings_that_rub_are_no_units(plain):
+    """Nearly all of their torque they need for themselves: "7 times what moves the robot"."""
+    rubbing = EffectInstance("steer_coulomb_friction", THESIS.caster_names, {"coulomb": 4.5})
+    assert found(THESIS, recorded(THESIS, [rubbing]))[0] is None
 
 
 def test_motors_behind_coupled_gears_are_told_and_left(plain):

@@ -63,6 +63,8 @@ RETUNED_SIGNIFICANCE = 2.0
 DETERMINED_PART = 0.3
 # More different effects than this at once are hardly what one robot has: who has its description mixed up gets them, too.
 MOST_AT_ONCE = 4
+# What names all that is missing closes the gap; of names that leave more than this part of it something else is at work, too.
+LEAST_CLOSED = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +151,8 @@ def analyse(
     proof = prover.prove(explanation, bool(commands.named))
     explanation = proof.explanation
     problem = explanation.search.problem
-    pairs = [*((named, _instance(named)) for named in explanation.named), *commands.named]
-    everything, crowded = doubted_in_a_crowd(pairs)
+    pairs, gaping = doubted_in_a_gap([(named, _instance(named)) for named in explanation.named], proof.finding.gap_closed)
+    everything, crowded = doubted_in_a_crowd([*pairs, *commands.named])
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
     numbers = {name: value for name, value in _reported_numbers(explanation).items() if name not in proof.untuned}
@@ -187,7 +189,7 @@ def analyse(
             *(_traces(other, proof.predicted, arguments, "holdout") if other is not None else ()),
         ),
         notes=(
-            *lengths, *crowded, *_notes(explanation, retuned, other is not None, proof, fit, commands.numbers),
+            *lengths, *gaping, *crowded, *_notes(explanation, retuned, other is not None, proof, fit, commands.numbers),
             *commands.notes, *responses,
         ),
         seconds=time.monotonic() - begun,
@@ -197,6 +199,26 @@ def analyse(
     return Analysis(findings, patched, _with_laws(subject, instances, numbers, unknown))
 
 
+def doubted_in_a_gap(
+    named: Sequence[tuple[NamedTerm, EffectInstance]], closed: float
+) -> tuple[Sequence[tuple[NamedTerm, EffectInstance]], tuple[str, ...]]:
+    """Return the effects, half as sure if they close but a small part of the gap, and what to know of that.
+
+    What is at work once, or in one recording, need not be so in what is held out, and where there is no gap none is closed.
+    """
+    elsewhere = any(entry.term.once or entry.term.recording is not None for entry, _ in named)
+    if not 0.0 < closed < LEAST_CLOSED or elsewhere or not named:
+        return named, ()
+    return _half_as_sure(named), (
+        f"What is named closes {100 * closed:.0f} % of the gap on what was held out: something else is missing, besides or "
+        "instead. All names are half as sure.",
+    )
+
+
+def _half_as_sure(named: Sequence[tuple[NamedTerm, EffectInstance]]) -> Sequence[tuple[NamedTerm, EffectInstance]]:
+    return [(dataclasses.replace(entry, probability=0.5 * entry.probability), instance) for entry, instance in named]
+
+
 def doubted_in_a_crowd(
     named: Sequence[tuple[NamedTerm, EffectInstance]]
 ) -> tuple[Sequence[tuple[NamedTerm, EffectInstance]], tuple[str, ...]]:
@@ -204,8 +226,7 @@ def doubted_in_a_crowd(
     kinds = len({entry.term.effect for entry, _ in named})
     if kinds <= MOST_AT_ONCE:
         return named, ()
-    doubted = [(dataclasses.replace(entry, probability=0.5 * entry.probability), instance) for entry, instance in named]
-    return doubted, (
+    return _half_as_sure(named), (
         f"{kinds} different effects at once are more than one robot is likely to have: is this its description? All names are "
         "half as sure.",
     )

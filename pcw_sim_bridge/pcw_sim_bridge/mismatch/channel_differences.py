@@ -27,20 +27,42 @@ class ChannelDifferences:
         motions: true motions, each with a pose.
         filters: of the channels, one per motion.
         measured, predicted, residual: filtered, (T, C).
+        on_ground: how the wheels of each motion roll under the torques that reach the ground; straight: the tyres there.
     """
 
-    def __init__(self, model: ChannelModel, motions: Sequence[RobotMotion], filters: Sequence[SignalFilter]) -> None:
+    def __init__(
+        self,
+        model: ChannelModel,
+        motions: Sequence[RobotMotion],
+        filters: Sequence[SignalFilter],
+        straight: Sequence[StraightTyres] | None = None,
+    ) -> None:
+        """Take the channels of true motions, each with a pose.
+
+        Args:
+            model: the channel model; motions: the motions; filters: of the channels, one per motion.
+            straight: the tyres of each motion; None: straight about the forces that there are.
+        """
         self.model, self.motions, self.filters = model, motions, filters
         self._states: list[RollingState] = []
         self._around: list[Surroundings] = []
         self.normal = [normal_along(motion, model.numbers) for motion in motions]
-        for motion, normal in zip(motions, self.normal, strict=True):
+        self.on_ground: list[RollingState] = []
+        self.straight: list[StraightTyres] = []
+        for index, (motion, normal) in enumerate(zip(motions, self.normal, strict=True)):
             around = model.around(motion)
-            state = rolling_state(motion, model.numbers, model.layout, around)
-            straight = StraightTyres.about(model.numbers, state.force, state.grip)
+            state = there = rolling_state(motion, model.numbers, model.layout, around)
+            if motion.lost is not None:
+                there = rolling_state(motion.without_lost(), model.numbers, model.layout, around)
+            if straight is None:
+                tyres = StraightTyres.about(model.numbers, there.force, there.grip, in_place=motion.lost is not None)
+            else:
+                tyres = straight[index]
             self._states.append(state)
+            self.on_ground.append(there)
+            self.straight.append(tyres)
             places = model.wheel_places(motion)
-            known = dataclasses.replace(around, straight=straight, normal=normal, places=places, wheels=state.wheels)
+            known = dataclasses.replace(around, straight=tyres, normal=normal, places=places, wheels=state.wheels)
             self._around.append(known)
         self._sides = [model.sides(motion, around) for motion, around in zip(motions, self._around, strict=True)]
         self.known = [np.isfinite(measured) for measured, _ in self._sides]

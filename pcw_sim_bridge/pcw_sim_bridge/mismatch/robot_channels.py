@@ -27,6 +27,7 @@ from .clock_leads import clock_leads
 from .errors import MismatchError
 from .first_look import Looked, remainder
 from .found_effect import effect_instance
+from .lost_torques import by_joint, lost_torques
 from .regression_problem import (
     BoolArray,
     Channel,
@@ -183,6 +184,11 @@ class RobotProblemBuilder:
         if self.layout.balanced:
             differences = ChannelDifferences(self.model, self.motions, self.filters)
             instruments = robot_nuisances(self.robot, differences, INSTRUMENTS)
+            lost = lost_torques(differences, self._valid(differences, at_peak=True), instruments, self._at_peak)
+            if lost is not None:
+                self._read = [dataclasses.replace(motion, lost=own) for motion, own in zip(self._read, lost, strict=True)]
+                self.motions = self._motions_of(self.model, leads=self._leads)
+                differences = ChannelDifferences(self.model, self.motions, self.filters)
             self._read = with_balanced_torques(self._read, differences, self._valid(differences), instruments)
             self.motions = self._motions_of(self.model, leads=self._leads)
         return self._as_read()
@@ -201,6 +207,7 @@ class RobotProblemBuilder:
         """
         varied = [n for n in varied_numbers(self.robot, differences) if n.label in changes]
         pieces, unsaid = [], _unsaid(self._leads, terms, sizes)
+        straight = iter(differences.straight)
         for recording in dict.fromkeys(motion.recording for motion in self._read):
             # What happened in one recording alone was not at work in another.
             own = [size for size in sizes if terms[size.term].recording in (None, recording)]
@@ -208,7 +215,10 @@ class RobotProblemBuilder:
             if model is None:
                 return None
             for motion in self._motions_of(model, recording, unsaid):
-                measured, predicted = model.sides(motion, model.around(motion))
+                around, tyres = model.around(motion), next(straight)
+                if tyres.in_place:
+                    around = dataclasses.replace(around, straight=tyres)
+                measured, predicted = model.sides(motion, around)
                 pieces.append(np.nan_to_num(measured - predicted))
         residual = differences.filtered(pieces)
         if unsaid.any():
@@ -225,7 +235,8 @@ class RobotProblemBuilder:
         if model is None:
             return None
         motions = self._motions_of(model, leads=_unsaid(self._leads, terms, lasting))
-        there = ChannelDifferences(model, motions, self.filters)
+        in_place = any(tyres.in_place for tyres in differences.straight)
+        there = ChannelDifferences(model, motions, self.filters, differences.straight if in_place else None)
         columns = on_all_cores(lambda n: there.of_numbers(n.vary, TANGENT_STEP * n.deviation), varied)
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
         return found | {nuisance.name: nuisance.column for nuisance in floor_nuisances(self.robot, there)}
@@ -288,20 +299,41 @@ class RobotProblemBuilder:
         return float(np.hypot(shared, MODEL_DEVIATION)) if self.layout.balanced else 0.0
 
     def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
-        """What the model misjudges in each sample (T, C): slips, by a part of those there are, and what an IMU leans."""
-        found = np.zeros_like(differences.predicted)
-        slips = differences.predicted[:, self.layout.consistency]
+        """What the model misjudges in each sample (T, C): slips, by a part of those there are, and what an IMU leans.
+
+        Besides what joints lose where their dry friction reverses.
+        """
+        found, predicted = np.zeros_like(differences.predicted), differences.predicted
+        lost = [motion.lost for motion in differences.motions if motion.lost is not None]
+        if lost:
+            predicted = predicted - differences.of_torque([own.torque[..., None] for own in lost])[:, :, 0]
+        slips = predicted[:, self.layout.consistency]
         if slips.size:
             found[:, self.layout.consistency] = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
         if self.layout.imu:
             found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
+        if lost:
+            doubts = [by_joint(own.doubt.reshape(len(own.doubt), -1, 1)) for own in lost]
+            found = np.sqrt(found**2 + np.sum(differences.of_torque(doubts) ** 2, axis=2))
         return found
 
-    def _valid(self, differences: ChannelDifferences) -> BoolArray:
-        """Samples (T, C) that the rolling model can judge: moving, no gross slip or shaking, sensor there."""
+    def _at_peak(self, motion: RobotMotion) -> BoolArray:
+        """Samples (T,) of a true motion in which tyres use so much friction that their slip is open."""
+        state = rolling_state(motion.without_lost(), self.numbers, self.layout, self.model.around(motion))
+        return used_friction(self.numbers, state) > USED_PART
+
+    def _valid(self, differences: ChannelDifferences, at_peak: bool = False) -> BoolArray:
+        """Samples (T, C) that the rolling model can judge: moving, no gross slip or shaking, sensor there.
+
+        Args:
+            differences: of these motions.
+            at_peak: also those in which tyres use so much friction that their slip is open.
+        """
         pieces = []
-        for motion, known in zip(self.motions, differences.known, strict=True):
-            bad = sliding(self.numbers, motion, self.layout)
+        for motion, known, state in zip(self.motions, differences.known, differences.on_ground, strict=True):
+            bad = slipping(self.numbers, motion, self.layout)
+            if self.layout.balanced and not at_peak:
+                bad |= used_friction(self.numbers, state) > USED_PART
             bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
@@ -399,6 +431,14 @@ def allowed_slip(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
 
 def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -> BoolArray:
     """Return the rows (T,) of a motion in which wheels slide, shake, or use so much friction that their slip is open."""
+    bad = slipping(numbers, motion, layout)
+    if layout.balanced:
+        bad |= used_friction(numbers, rolling_state(motion, numbers, layout)) > USED_PART
+    return bad
+
+
+def slipping(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -> BoolArray:
+    """Return the rows (T,) of a motion in which wheels are seen to slide or shake."""
     twist, contradiction = twists(numbers, numbers.headings(motion.position), motion.velocity)
     allowed = allowed_slip(numbers, twist)
     reach = float(np.max(np.linalg.norm(numbers.steer_axis, axis=1)))
@@ -412,10 +452,7 @@ def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -
         bad |= sudden_slip(turned, twist, motion.rate, reach, GROSS * allowed)
     else:
         bad = sudden_slip(tracked, rolled, motion.rate, reach, allowed)
-    bad = bad | (motion.shaking > SHAKING_PART * allowed)
-    if layout.balanced:
-        bad |= used_friction(numbers, rolling_state(motion, numbers, layout)) > USED_PART
-    return bad
+    return bad | (motion.shaking > SHAKING_PART * allowed)
 
 
 def used_friction(numbers: ModelNumbers, state: RollingState) -> FloatArray:

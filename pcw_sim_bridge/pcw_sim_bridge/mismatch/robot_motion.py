@@ -37,6 +37,19 @@ SHORTEST_SEGMENT = 1.0  # [s]
 
 
 @dataclasses.dataclass(frozen=True)
+class LostTorque:
+    """What joints lose along a motion before it reaches the ground, see `lost_torques`.
+
+    Attributes:
+        torque: that is added to theirs (T, n, 2) [N m].
+        doubt: by how much it may be wrong where dry friction reverses (T, n, 2) [N m].
+    """
+
+    torque: FloatArray
+    doubt: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
 class RobotMotion:
     """One contiguous piece on a regular grid after the wide filter; arrays along T.
 
@@ -56,6 +69,7 @@ class RobotMotion:
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
         shaking: speed at which the contacts of wheels shake that the filter smooths away (T,) [m/s]; its frequency [Hz].
+        lost: what joints seem to lose; None where that matters little, or nobody has looked.
     """
 
     recording: int
@@ -77,6 +91,14 @@ class RobotMotion:
     tracked_twist: FloatArray
     shaking: FloatArray
     shaking_frequency: float
+    lost: LostTorque | None = None
+
+    def without_lost(self) -> RobotMotion:
+        """Return the motion with the torques that reach the ground."""
+        if self.lost is None:
+            return self
+        torque, quiet = (values + self.lost.torque for values in (self.torque, self.quiet_torque))
+        return dataclasses.replace(self, torque=torque, quiet_torque=quiet, lost=None)
 
     @property
     def yaw(self) -> FloatArray:

@@ -131,6 +131,7 @@ class StraightTyres:
         tyres: numbers of the tyres that it holds for (n, TYRE_SIZE).
         force, grip: where it is exact (T, n, 2), (T, n) [N].
         ratio: slip ratios there (T, n, 2); of_force, of_grip: their slopes (T, n, 2, 2), (T, n, 2) [1/N].
+        in_place: tyres of other curves are straightened there, too, wherever their forces are.
     """
 
     tyres: FloatArray
@@ -139,9 +140,10 @@ class StraightTyres:
     ratio: FloatArray
     of_force: FloatArray
     of_grip: FloatArray
+    in_place: bool = False
 
     @classmethod
-    def about(cls, numbers: ModelNumbers, force: FloatArray, grip: FloatArray) -> StraightTyres:
+    def about(cls, numbers: ModelNumbers, force: FloatArray, grip: FloatArray, in_place: bool = False) -> StraightTyres:
         """Straighten the tyres of a model about forces (T, n, 2) and loads (T, n)."""
         tyres = numbers.tyres.copy()
         plain = slip_ratios(tyres, force, grip)
@@ -152,7 +154,7 @@ class StraightTyres:
             changed[:, :, axis] += step
             of_force[:, :, :, axis] = (slip_ratios(tyres, changed, grip) - plain) / step[:, :, None]
         of_grip = (slip_ratios(tyres, force, grip + step) - plain) / step[:, :, None]
-        return cls(tyres, force, grip, plain, of_force, of_grip)
+        return cls(tyres, force, grip, plain, of_force, of_grip, in_place)
 
     def ratios(self, force: FloatArray, grip: FloatArray) -> FloatArray:
         """Slip ratios (T, n, 2) under other forces and loads."""
@@ -617,6 +619,8 @@ def slips(
     """Slip velocities (T, n, 2) [m/s] of rolling tyres under forces (T, n, 2) and loads times friction factors (T, n) [N]."""
     if straight is not None and np.array_equal(straight.tyres[:, :LENGTH], numbers.tyres[:, :LENGTH]):
         ratio = straight.ratios(force, grip)
+    elif straight is not None and straight.in_place:
+        ratio = StraightTyres.about(numbers, straight.force, straight.grip).ratios(force, grip)
     else:
         ratio = slip_ratios(numbers.tyres, force, grip)
     ratio = numbers.softness * ratio

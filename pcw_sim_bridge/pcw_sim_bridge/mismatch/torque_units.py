@@ -22,6 +22,7 @@ from .regression_problem import FloatArray, RegressionProblem
 from .reported_torques import unlikely_factor
 
 TORQUE_CONSTANT = "torque_constant_error"
+FRICTIONS = ("drive_coulomb_friction", "drive_viscous_friction", "steer_coulomb_friction", "steer_viscous_friction")
 # Factors have to explain this part of the square of what forces leave of the description.
 EXPLAINED = 0.9
 # Within these bounds a factor is a weak motor, or a heavy load.
@@ -93,14 +94,15 @@ def torque_units(robot: RobotDescription, problem: RegressionProblem) -> TorqueU
 
 def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | None:
     """Factors of all drives' and all steerings' torques that move the robot as it moves (2,); None where they say little."""
-    both = [
-        term for axis in AXIS_NAMES for term in problem.terms
-        if term.effect == TORQUE_CONSTANT and term.axis == axis and term.target == robot.caster_names
-    ]  # fmt: skip
+    of_all = [term for term in problem.terms if term.target == robot.caster_names]
+    both = [term for axis in AXIS_NAMES for term in of_all if term.effect == TORQUE_CONSTANT and term.axis == axis]
+    rubbing = [term for term in of_all if term.effect in FRICTIONS]
     force = [c for c, channel in enumerate(problem.channels) if channel.name.startswith("chassis_")]
     if len(both) != len(AXIS_NAMES) or not force:
         return None
-    columns = np.concatenate([term.columns(term.shapes[0]) for term in both], axis=2)
+    # Steerings that rub need many times the torque that moves the robot, and are no steerings in other units.
+    parts = [term.columns(term.shapes[0])[:, :, list(term.base_indices())] for term in (*both, *rubbing)]
+    columns = np.concatenate(parts, axis=2)
     rows, left = [], []
     for c in force:
         valid = problem.valid[:, c]
@@ -117,7 +119,7 @@ def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | 
     remaining = wanted - design @ errors
     if remaining @ remaining > (1.0 - EXPLAINED) * (wanted @ wanted):
         return None
-    gains: FloatArray = 1.0 + errors
+    gains: FloatArray = 1.0 + errors[: len(AXIS_NAMES)]
     return gains
 
 
