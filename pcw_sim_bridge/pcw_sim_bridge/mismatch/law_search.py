@@ -54,6 +54,8 @@ CLEAR_PART = 0.5
 # So much smaller than all that was measured a law may be expected to be that stands for a name.
 SMALLER_PARTS = (0.3, 0.1, 0.03, 0.01)
 MENDING_PART = 0.05
+# A law that differs from a name by less than this part of what the name does leaves it this part of its probability.
+TRIFLE, MOST = 0.03, 0.9
 # A law of a motor's own torque that takes away more of it than this only says that the joint does not accelerate.
 LARGEST_MOTOR_PART = 0.5
 
@@ -69,6 +71,7 @@ class FoundLaw:
         withdrawn: instances whose name is withdrawn.
         counts: whether it is sure enough to be told. If not, it is a doubt about the names that it would withdraw.
         alike: whether the names that it would withdraw do most of what it does.
+        apart: by which part of what these names do the law differs from them, where they are clearest.
     """
 
     law: Law
@@ -79,15 +82,18 @@ class FoundLaw:
     withdrawn: tuple[Instance, ...]
     counts: bool
     alike: bool
+    apart: float
 
     @property
     def belief(self) -> float:
         """What is left of the probability of the names that it would withdraw.
 
-        Half of it where name and law explain nearly the same: then details of the model decide between them.
+        Half of it where name and law explain nearly the same: then details of the model decide between them. Most of it where
+        they are the same but for a trifle.
         """
         odds = math.exp(min(min(self.gain, self.held_out) - HYPOTHESES_COST, 50.0))
-        return max(1.0 / (1.0 + odds), 0.5 if self.alike else 0.0)
+        least = (MOST if self.apart < TRIFLE else 0.5) if self.alike else 0.0
+        return max(1.0 / (1.0 + odds), least)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,7 +274,18 @@ class LawSearch:
             trial.law, gain, held_out, min(both / max(scores[2], 1e-300), 1.0),
             tuple(plain[i.term] if i.term in plain else i for i in names),
             tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
+            self._apart(problem, with_law, without, replaced),
         )
+
+    def _apart(self, problem: RegressionProblem, with_law: Fit, without: Fit, dropped: Sequence[bool]) -> float:
+        """By which part of what the dropped names do the prediction with the law differs, where these are clearest."""
+        left = np.where(problem.valid, problem.residual - predicted(problem, with_law), np.nan)
+        change = np.where(problem.valid, predicted(problem, with_law) - predicted(problem, without), 0.0)
+        does = np.where(problem.valid, _part_of(problem, without, dropped), 0.0)
+        noise = np.array([robust_deviation(column[np.isfinite(column)]) for column in left.T])
+        own, other = (np.sqrt(np.mean(values**2, axis=0)) for values in (does, change))
+        clear = own / noise >= CLEAR_PART * np.max(own / noise)
+        return float(np.max(other[clear] / np.maximum(own[clear], 1e-300)))
 
     def _matters(
         self, problem: RegressionProblem, law: Law, with_law: Fit, without: Fit, dropped: Sequence[bool]
@@ -289,29 +306,23 @@ class LawSearch:
             return np.asarray(np.sqrt(np.nanmean((values * blank)[:, channels] ** 2, axis=0)), dtype=np.float64)
 
         noise = np.array([robust_deviation(left[problem.valid[:, c], c]) for c in channels])
-        replaced, changed = np.zeros_like(change), np.zeros_like(change)
-        position = len(problem.nuisances)
-        for instance, drop in zip(without.instances, dropped, strict=True):
-            term = problem.terms[instance.term]
-            columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
-            does = columns @ without.mean[position : position + len(instance.active)]
-            position += len(instance.active)
-            if drop:
-                replaced += does
-            elif changes_law_of(law, term):
-                changed += does
+        beside = [
+            not drop and changes_law_of(law, problem.terms[instance.term])
+            for instance, drop in zip(without.instances, dropped, strict=True)
+        ]
+        replaced, changed = _part_of(problem, without, dropped), _part_of(problem, without, beside)
         shown = sizes(changed) / np.maximum(noise, 1e-300)
         names = sizes(replaced) + np.where(shown >= CLEAR_PART * shown.max(initial=0.0), sizes(changed), 0.0)
         guessed = False
-        for channel, size, signal, own, beside in zip(
+        for channel, size, signal, own, remains in zip(
             channels, sizes(change), sizes(problem.measured), names, noise, strict=True
         ):
             valid = problem.valid[:, channel]
             enough = 0.0 if "time" in law.depends_on else max(SMALLEST_PART, 3.0 * problem.scale_deviation) * signal
             if own > 0.0:
                 enough = min(enough, REPLACED_PART * own)
-                beside = min(beside, own)  # a name that lies below the noise gives way to a law that lies below it
-            if size <= max(SMALLEST_SHARE * beside, enough):
+                remains = min(remains, own)  # a name that lies below the noise gives way to a law that lies below it
+            if size <= max(SMALLEST_SHARE * remains, enough):
                 continue
             if problem.misjudged is None or size > float(np.sqrt(np.mean(problem.misjudged[valid, channel] ** 2))):
                 return True
@@ -321,6 +332,17 @@ class LawSearch:
         unlike = alone and not _is_of_others(law)
         least = settings.least_peculiar_unlike if unlike else settings.least_peculiar
         return (guessed or alone) and self.search.whiten_at(left).peculiar(change) > least
+
+
+def _part_of(problem: RegressionProblem, fit: Fit, which: Sequence[bool]) -> FloatArray:
+    """What some of a fit's effects do to the channels (T, C)."""
+    does, position = np.zeros_like(problem.residual), len(problem.nuisances)
+    for instance, wanted in zip(fit.instances, which, strict=True):
+        if wanted:
+            columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
+            does += columns @ fit.mean[position : position + len(instance.active)]
+        position += len(instance.active)
+    return does
 
 
 def _own_speed(site: str) -> tuple[Combination, ...]:
