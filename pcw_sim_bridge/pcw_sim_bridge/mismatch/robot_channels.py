@@ -50,6 +50,7 @@ from .robot_nuisances import (
 )
 from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
+from .seeming_geometry import seeming_numbers
 from .signal_filter import SignalFilter
 from .sudden_slip import spinning, sudden_slip
 from .torque_errors import INSTRUMENTS, with_balanced_torques
@@ -115,6 +116,7 @@ class RobotProblemBuilder:
         self.motions = self._motions_of(self.model)
         # By how much clocks are ahead that are far off; columns are taken as if that were known.
         self._leads = np.zeros(2)
+        self._seeming: ModelNumbers | None = None
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -317,6 +319,15 @@ class RobotProblemBuilder:
             found = np.sqrt(found**2 + np.sum(differences.of_torque(doubts) ** 2, axis=2))
         return found
 
+    def _seeming_numbers(self, differences: ChannelDifferences) -> ModelNumbers:
+        """The numbers by which wheels slide least."""
+        if self._seeming is None and self.layout.redundant:
+            self._seeming = seeming_numbers(
+                self.numbers, varied_numbers(self.robot, differences), self.motions,
+                lambda numbers, motion: slipping(numbers, motion, self.layout), SLIP_FLOOR,
+            )
+        return self._seeming or self.numbers
+
     def _at_peak(self, motion: RobotMotion) -> BoolArray:
         """Samples (T,) of a true motion in which tyres use so much friction that their slip is open."""
         state = rolling_state(motion.without_lost(), self.numbers, self.layout, self.model.around(motion))
@@ -329,9 +340,9 @@ class RobotProblemBuilder:
             differences: of these motions.
             at_peak: also those in which tyres use so much friction that their slip is open.
         """
-        pieces = []
+        pieces, seeming = [], self._seeming_numbers(differences)
         for motion, known, state in zip(self.motions, differences.known, differences.on_ground, strict=True):
-            bad = slipping(self.numbers, motion, self.layout)
+            bad = slipping(seeming, motion, self.layout)
             if self.layout.balanced and not at_peak:
                 bad |= used_friction(self.numbers, state) > USED_PART
             bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
