@@ -709,7 +709,7 @@ def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path, healthy: Re
 def test_steerings_that_rub_leave_tyres_off_the_peak_of_their_friction():
     """As forces of the ground their torques would use up its friction, and six samples of ten not be judged."""
     rubbing = EffectInstance("steer_coulomb_friction", THESIS.caster_names, {"coulomb": 4.5})
-    recording = simulate(World(THESIS, THESIS, "reduced"), Run("run", "identification", 15.0, 3), [rubbing])
+    recording = identified(rubbing)
     problem = RobotProblemBuilder(THESIS, [recording]).build(keys={term_key(rubbing.name, rubbing.target, None, None)})
     assert np.mean(problem.valid[:, 0]) > 0.8
     # With it in the description they are the ground's, and as far from the peak.
@@ -723,3 +723,33 @@ def test_steerings_that_rub_leave_tyres_off_the_peak_of_their_friction():
     here = problem.valid[:, 0]
     assert np.linalg.norm((problem.residual - 4.5 * column - exact)[here]) < 0.02 * np.linalg.norm(problem.residual[here])
     assert np.linalg.norm(exact[here, :3]) < 0.1 * np.linalg.norm(problem.residual[here, :3])
+
+
+def identified(*effects):
+    """What a robot with some effects records while it is excited as for an identification."""
+    return simulate(World(THESIS, THESIS, "reduced"), Run("run", "identification", 15.0, 3), effects)
+
+
+def test_a_steering_that_is_turned_is_no_slide():
+    """By the description its wheel would slide in every sample, and none was judged."""
+    turned = EffectInstance("steer_zero_offset", (THESIS.caster_names[1],), {"offset": -0.5})
+    problem = RobotProblemBuilder(THESIS, [identified(turned)]).build(with_terms=False)
+    assert np.mean(problem.valid[:, 0]) > 0.8
+
+
+def test_wheels_that_slide_are_no_other_geometry():
+    """On a slippery floor they do in a third of the samples, and no number of the description undoes it."""
+    floor = {"factor": 0.1, "x": 0.3, "y": 0.0, "length": 1.0, "width": 1.0}
+    slippery = EffectInstance("low_friction_patch", THESIS.caster_names, floor)
+    problem = RobotProblemBuilder(THESIS, [identified(slippery)]).build(with_terms=False)
+    here = problem.valid[:, 0]
+    assert 0.5 < np.mean(here) < 0.8
+    assert np.max(np.abs(problem.residual[here, 3:11])) < 0.03
+
+
+def test_it_is_said_when_torques_use_up_the_friction():
+    recording = identified()
+    joints = recording.joint_states
+    loud = dataclasses.replace(recording, joint_states=dataclasses.replace(joints, effort=20.0 * joints.effort))
+    said, silent = (RobotProblemBuilder(THESIS, [one]).build(with_terms=False).remarks for one in (loud, recording))
+    assert len(said) == 1 and "of its friction" in said[0] and not silent

@@ -125,7 +125,7 @@ def analyse(
     inputs = tuple(o.finding for o in (*opened, *held_out))
     judged = problem.valid.any(axis=1)
     usable = float(judged.sum()) / problem.rate
-    if usable < LEAST_DURATION or (problem.remarks and judged.mean() < LEAST_UNDISTURBED):
+    if usable < LEAST_DURATION or (problem.shaken and judged.mean() < LEAST_UNDISTURBED):
         note = (
             f"only {usable:.1f} s of usable motion (moving, no gross slip), {100 * judged.mean():.0f} % of what was recorded; "
             f"at least {LEAST_DURATION:g} s are needed, and {100 * LEAST_UNDISTURBED:.0f} % where wheels shake"

@@ -314,6 +314,7 @@ class RegressionProblem:
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
         remarks: what a reader has to know of the recordings.
+        shaken: whether one of these is that wheels shake.
         near: how columns of a term follow from its derivatives, by term; see `around`.
     """
 
@@ -341,6 +342,7 @@ class RegressionProblem:
     point: Point | None = None
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    shaken: bool = False
     near: Mapping[int, _NearSecant] = dataclasses.field(default_factory=dict)
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False

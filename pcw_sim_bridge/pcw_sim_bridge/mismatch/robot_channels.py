@@ -68,6 +68,7 @@ SLOWER = 3.0  # so much less than the residual's is the cut-off of variables wit
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slips to and fro is less than at its average slip
 SHAKEN_PART = 0.05  # of the samples in which wheels shake is worth a word
+LIMITED_PART = 0.3  # of the samples in which their friction is used up is, too
 # What every model has a little wrong, of each wheel by itself, and not always by as much.
 DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_lateral_stiffness")
 # Part of a tolerance over which a number's column is taken anew: by a wider one's curvature an effect on it would be told
@@ -144,6 +145,7 @@ class RobotProblemBuilder:
         rate = float(np.mean([f.decimated_rate for f in self.filters]))
         terms: tuple[Term, ...] = ()
         places, headings = self._wheels()
+        shaken = self._shaken()
         if with_terms:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
@@ -174,7 +176,8 @@ class RobotProblemBuilder:
             exact=exact,
             derive=functools.partial(self._derive, differences, terms),
             softened=self._softened if self.layout.balanced else None,
-            remarks=self._remarks(),
+            remarks=(*shaken, *self._at_the_limit(differences)),
+            shaken=bool(shaken),
         )
 
     @functools.cached_property
@@ -359,8 +362,22 @@ class RobotProblemBuilder:
         silent[self.layout.consistency] = contradicted < ROUNDING * rolled * float(np.max(self.numbers.radius))
         return silent
 
-    def _remarks(self) -> tuple[str, ...]:
-        """What keeps samples from being judged that a user can mend."""
+    def _at_the_limit(self, differences: ChannelDifferences) -> tuple[str, ...]:
+        """That friction is used up in many samples, which are not judged, and what that may come from."""
+        if not self.layout.balanced:
+            return ()
+        used = np.concatenate([used_friction(self.numbers, state) for state in differences.on_ground])
+        part = float(np.mean(used > USED_PART))
+        if part < LIMITED_PART:
+            return ()
+        return (
+            f"In {100 * part:.0f} % of the samples a wheel uses more than {100 * USED_PART:.0f} % of its friction, by the "
+            "recorded torques, so that its slip may be anything; they were not judged. Wheels of a robot that drives gently work "
+            "against each other then, a zero or a radius being far off, or torques are in other units than N m at the joints.",
+        )
+
+    def _shaken(self) -> tuple[str, ...]:
+        """That wheels shake, which keeps samples from being judged and can be mended."""
         shaken = np.concatenate([motion.shaking > SHAKING_PART * SLIP_FLOOR for motion in self.motions])
         if np.mean(shaken) < SHAKEN_PART:
             return ()

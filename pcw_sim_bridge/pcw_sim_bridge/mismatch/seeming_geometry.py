@@ -58,10 +58,16 @@ def seeming_numbers(
             number.vary(trial, float(np.clip(FAR * number.deviation * change, *number.changes)))
         return trial
 
+    def rolled(trial: ModelNumbers) -> tuple[FloatArray, float]:
+        twist, contradiction = twists(trial, trial.headings(position), velocity)
+        return contradiction, float(np.sqrt(np.mean(twist**2)))
+
+    _, usual = rolled(numbers)
+
     def errors(changes: FloatArray) -> FloatArray:
-        trial = changed(changes)
-        _, contradiction = twists(trial, trial.headings(position), velocity)
-        return np.concatenate([contradiction.ravel() / slip, changes])
+        # Smaller wheels altogether would contradict each other less.
+        contradiction, motion = rolled(changed(changes))
+        return np.concatenate([contradiction.ravel() * (usual / motion / slip), changes])
 
     found = optimize.least_squares(errors, np.zeros(len(geometry)), loss="soft_l1", x_scale=0.1, max_nfev=20)
     seeming = changed(found.x)
