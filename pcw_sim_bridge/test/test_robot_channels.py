@@ -752,4 +752,4 @@ def test_it_is_said_when_torques_use_up_the_friction():
     joints = recording.joint_states
     loud = dataclasses.replace(recording, joint_states=dataclasses.replace(joints, effort=20.0 * joints.effort))
     said, silent = (RobotProblemBuilder(THESIS, [one]).build(with_terms=False).remarks for one in (loud, recording))
-    assert len(said) == 1 and "of its friction" in said[0] and not silent
+    assert len(said) == 1 and "of a wheel's friction" in said[0] and not silent

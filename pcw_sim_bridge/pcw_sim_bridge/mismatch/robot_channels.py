@@ -371,9 +371,9 @@ class RobotProblemBuilder:
         if part < LIMITED_PART:
             return ()
         return (
-            f"In {100 * part:.0f} % of the samples a wheel uses more than {100 * USED_PART:.0f} % of its friction, going by the "
-            "torques, so that its slip may be anything; they were not judged. If the robot drives gently its wheels work against "
-            "each other, a zero or a radius being far off, or torques are in other units than N m at the joints.",
+            f"In {100 * part:.0f} % of the samples torques use more than {100 * USED_PART:.0f} % of a wheel's friction, so that "
+            "its slip may be anything; they were not judged. If the robot drives gently its wheels work against each other, a "
+            "zero or a radius being far off, or torques are in other units than N m at the joints.",
         )
 
     def _shaken(self) -> tuple[str, ...]:
