@@ -371,8 +371,8 @@ class RobotProblemBuilder:
         if part < LIMITED_PART:
             return ()
         return (
-            f"In {100 * part:.0f} % of the samples torques use more than {100 * USED_PART:.0f} % of a wheel's friction: "
-            "its slip may be anything, and they were not judged. If the robot drives gently its wheels work against each other, a "
+            f"In {100 * part:.0f} % of the samples torques use more than {100 * USED_PART:.0f} % of a wheel's friction: its "
+            "slip may be anything, and they were not judged. If the robot drives gently its wheels work against each other, a "
             "zero or a radius being far off, or torques are in other units than N m at the joints.",
         )
 
