@@ -151,7 +151,9 @@ def analyse(
     proof = prover.prove(explanation, bool(commands.named))
     explanation = proof.explanation
     problem = explanation.search.problem
-    pairs, gaping = doubted_in_a_gap([(named, _instance(named)) for named in explanation.named], proof.finding.gap_closed)
+    pairs, gaping = doubted_in_a_gap(
+        [(named, _instance(named)) for named in explanation.named], 0.0 if proof.untuned else proof.finding.gap_closed
+    )
     everything, crowded = doubted_in_a_crowd([*pairs, *commands.named])
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
@@ -204,7 +206,7 @@ def doubted_in_a_gap(
 ) -> tuple[Sequence[tuple[NamedTerm, EffectInstance]], tuple[str, ...]]:
     """Return the effects, half as sure if they close but a small part of the gap, and what to know of that.
 
-    What is at work once, or in one recording, need not be so in what is held out, and where there is no gap none is closed.
+    What is at work once, or in one recording, need not be so in what is held out, and where there is no gap none is closed: 0.
     """
     elsewhere = any(entry.term.once or entry.term.recording is not None for entry, _ in named)
     if not 0.0 < closed < LEAST_CLOSED or elsewhere or not named:
@@ -249,8 +251,13 @@ def _instance(named: NamedTerm) -> EffectInstance:
 
 
 def _reported_numbers(explanation: Explanation) -> dict[str, float]:
-    """Numbers of the description that the recordings move, by name."""
-    return {number.name: number.value for number in _retuned(explanation.search.problem, explanation.fit)}
+    """Numbers of the description that the recordings move, by name, within what makes sense.
+
+    Beyond it a first order leads on, and tyres like stone lead a simulation astray.
+    """
+    problem = explanation.search.problem
+    bounds = {n.name: (n.nominal + n.changes[0], n.nominal + n.changes[1]) for n in problem.nuisances}
+    return {n.name: float(np.clip(n.value, *bounds[n.name])) for n in _retuned(problem, explanation.fit)}
 
 
 def _unknown(

@@ -48,6 +48,7 @@ KINDS = (
     ("chassis.", "module.", "wheel.inertia", "rotors."), ("torque_constant/",), ("contact.",),
     ("wheel_radius", "caster_offset", "steer_axis", "steer_zero"),
 )  # fmt: skip
+ASTRAY = 4.0  # times the mean square of what the description leaves a simulation
 # Of its channel's floor; an event that moves a channel by less is over.
 EVENT_SHARE = 0.1
 
@@ -210,10 +211,15 @@ class Prover:
         if not self._is_patched(explanation):
             return frozenset()
         bare = self._error(explanation, held_out, _predicted_without(held_out, everything))
+        strictly = self._goes_astray(explanation, after)
+        if strictly:  # where the effects do so by themselves, that is no reason to do without the numbers
+            self.untuned = everything
+            strictly = not self._goes_astray(explanation, self._rollout(explanation, held_out))
 
         def helps(left_out: frozenset[str], simulated: FloatArray | None) -> bool:
             own = self._error(explanation, held_out, _predicted_without(held_out, left_out))
-            return own <= bare and not self._simulates_worse(explanation, simulated)
+            astray = strictly and self._goes_astray(explanation, simulated)
+            return own <= bare and not astray and not self._simulates_worse(explanation, simulated)
 
         left_out: frozenset[str] = frozenset()
         kinds = [kind for k in KINDS if (kind := frozenset(name for name in everything if name.startswith(k)))]
@@ -252,6 +258,13 @@ class Prover:
             return False
         errors = _rollout_errors(windows, self.before, after, self.rng, [MAIN_HORIZON]).pooled()
         return bool(len(errors.judged)) and float(errors.worse()[0]) > 0.0
+
+    def _goes_astray(self, explanation: Explanation, after: FloatArray | None) -> bool:
+        """Whether the patched description leaves far more than the nominal one, be it in a few windows alone."""
+        windows = self._quiet_windows(explanation)
+        if windows is None or self.before is None or after is None:
+            return False
+        return self._simulated_error(explanation, after) > ASTRAY * self._simulated_error(explanation, self.before)
 
     def _is_patched(self, explanation: Explanation) -> bool:
         """Whether there is anything beside which numbers of the description are re-tuned."""
