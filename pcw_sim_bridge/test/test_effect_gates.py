@@ -65,12 +65,3 @@ def test_what_has_a_shape_of_its_own_needs_less_to_be_told_from_errors(term: dic
     size, remains, none = np.array([0.5]), np.array([0.1]), np.array([0.0])
     share = EffectGates(problem, settings)._share(regression, [SimpleNamespace(term=0)], size[:, None], size, (remains, none))
     assert (share >= 1.0) == passes
-
-
-@pytest.mark.parametrize(("loose", "relieved"), [(False, 0.5 * (8.0**2 - 1.0)), (True, 0.5 * (2.0**2 - 0.5**2))])
-def test_the_one_number_that_an_effect_relieves_most_is_counted_unless_it_is_loose(loose: bool, relieved: float) -> None:
-    """A motor that gave a tenth less was eight tolerances of a torque constant and no effect: it held noise of its torques."""
-    numbers = [SimpleNamespace(deviation=0.01, loose=loose), SimpleNamespace(deviation=2.0, loose=False)]
-    gates = EffectGates(SimpleNamespace(nuisances=numbers), SelectionSettings())
-    without, fit = SimpleNamespace(mean=np.array([-0.08, 4.0])), SimpleNamespace(mean=np.array([0.01, 1.0, 0.1]))
-    assert gates._relieved(without, fit) == pytest.approx(relieved)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -525,6 +526,15 @@ def test_an_effect_is_no_patch_without_numbers_that_it_needs(astray: bool) -> No
     assert (Prover._no_better(prover, explanation, held_out) is not None) is astray  # type: ignore[arg-type]
 
 
+def helped_by(numbers: Sequence[SimpleNamespace]) -> SimpleNamespace:
+    """Held-out data of which every number explains a fifth."""
+    true = np.sin(np.arange(400.0))[:, None]
+    return SimpleNamespace(
+        nuisances=len(numbers), problem=SimpleNamespace(residual=true, nominal_residual=true, nuisances=numbers),
+        means=lambda: np.full((1, len(numbers)), 0.2), predicted=lambda means: true * means.sum(),
+    )
+
+
 @pytest.mark.parametrize(
     ("astray", "left_out"),
     [((), set()), (("chassis.",), {"chassis.mass"}), (("chassis.", "contact."), {"chassis.mass", "contact.mu_p"}),
@@ -534,12 +544,7 @@ def test_only_numbers_that_lead_a_simulation_astray_stay_as_described(astray: tu
     """Of 49 numbers five masses made a simulation worse; without the rest a quarter of the gap was closed, with it all."""
     explanation = retunable("chassis.mass", "contact.mu_p", "torque_lag")
     numbers = explanation.search.problem.nuisances
-    true = np.sin(np.arange(400.0))[:, None]
-    problem = SimpleNamespace(residual=true, nominal_residual=true, nuisances=numbers)
-    held_out = SimpleNamespace(
-        nuisances=len(numbers), problem=problem, means=lambda: np.full((1, len(numbers)), 0.2),
-        predicted=lambda means: true * means.sum(),
-    )
+    held_out = helped_by(numbers)
 
     def simulated(prover: SimpleNamespace) -> float:
         return 1.0 + sum(n.name.startswith(astray) for n in numbers if n.name not in prover.untuned) if astray else 1.0
@@ -560,12 +565,7 @@ def test_numbers_with_which_a_few_windows_run_away_stay_as_described(culprit: st
     """In three windows of nineteen tyres as hard as stone let wheels spin: too few for a mean to be worse for sure."""
     explanation = retunable("chassis.mass", "contact.mu_p")
     numbers = explanation.search.problem.nuisances
-    true = np.sin(np.arange(400.0))[:, None]
-    problem = SimpleNamespace(residual=true, nominal_residual=true, nuisances=numbers)
-    held_out = SimpleNamespace(
-        nuisances=len(numbers), problem=problem, means=lambda: np.full((1, len(numbers)), 0.2),
-        predicted=lambda means: true * means.sum(),
-    )
+    held_out = helped_by(numbers)
 
     def simulated(prover: SimpleNamespace) -> np.ndarray:
         patched = {number.name for number in numbers} - prover.untuned

@@ -21,8 +21,6 @@ NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
 LOOSE_PART = 0.2
 # Such an effect must do this part of what remains in some channel, and all of it where it is on all casters, as noise is.
 NOISY_PART = 0.75
-# Or do the work of one number that would else be more than six tolerances off [nats]: half of that is what noise does to one.
-ONE_NUMBER = 20.0
 
 
 class EffectGates:
@@ -51,7 +49,7 @@ class EffectGates:
         own: list[FloatArray] = []
         net: list[FloatArray] = []
         changes: list[FloatArray] = []
-        retunings, relieved, bursts = [], [], []
+        retunings, bursts = [], []
         explained = predicted(self.problem, fit)
         for index, instance in enumerate(instances):
             others = instances[:index] + instances[index + 1 :]
@@ -71,7 +69,6 @@ class EffectGates:
             bursts.append(0.5 * self._largest_burst(unexplained, _at_work(part)) if once else 0.0)
             firm = regression.tolerance_cost(without, firm=True) - regression.tolerance_cost(fit, firm=True)
             retunings.append(firm + LOOSE_PART * (retuning - firm))
-            relieved.append(self._relieved(without, fit))
         total = np.sqrt(np.sum(np.square(own), axis=0))
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
@@ -82,19 +79,10 @@ class EffectGates:
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
                 beside = sizes / np.maximum(self._least(instance) * remains, 1e-300)
                 alone = own[index] / np.maximum(np.maximum(NOISY_FACTOR * remains, self._details([instance])), 1e-300)
-                needed = max(min(needed, float(np.max(np.maximum(beside, alone)))), relieved[index] / ONE_NUMBER)
+                needed = min(needed, float(np.max(np.maximum(beside, alone))))
             share = max(share, needed)
             shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
         return losses, held_out, shares
-
-    def _relieved(self, without: Fit, fit: Fit) -> float:
-        """What the one number that most depends on it costs less [nats] by a fit than by another; none that is loose."""
-        costs = [
-            0.5 * (float(before) ** 2 - float(after) ** 2) / number.deviation**2
-            for number, before, after in zip(self.problem.nuisances, without.mean, fit.mean, strict=False)
-            if not number.loose
-        ]
-        return max(costs, default=0.0)
 
     def _largest_burst(self, unexplained: FloatArray, at_work: BoolArray) -> float:
         """Most that is left unexplained (T,), beyond what noise leaves, anywhere in a time as long as one at work (T,)."""

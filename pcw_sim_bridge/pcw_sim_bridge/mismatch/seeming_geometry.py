@@ -18,8 +18,8 @@ from .robot_motion import RobotMotion
 from .robot_nuisances import VariedNumber
 from .rolling_model import ModelNumbers, twists
 
-GEOMETRY = ("wheel_radius/", "caster_offset.", "steer_zero/")
-FAR = 300.0  # tolerances that a number may be off by before it counts as much as a slide
+# Kinds of numbers, and how many tolerances these may be off by; a robot that is farther from its description is another one.
+GEOMETRY = {"wheel_radius/": 120.0, "caster_offset.": 120.0, "steer_zero/": 300.0}
 MOST_ROWS = 3000  # of motions, enough for a few numbers of every caster
 LEAST_PART = 0.05  # of the samples that have to be no slides any more
 
@@ -43,7 +43,8 @@ def seeming_numbers(
     def part(trial: ModelNumbers) -> float:
         return float(np.mean(np.concatenate([sliding(trial, motion) for motion in motions])))
 
-    before, geometry = part(numbers), [number for number in varied if number.label.startswith(GEOMETRY)]
+    before = part(numbers)
+    geometry = [(number, far) for number in varied for kind, far in GEOMETRY.items() if number.label.startswith(kind)]
     if before < LEAST_PART:
         return numbers
     step = max(1, sum(len(motion.time) for motion in motions) // MOST_ROWS)
@@ -54,8 +55,8 @@ def seeming_numbers(
 
     def changed(changes: FloatArray) -> ModelNumbers:
         trial = numbers.copy()
-        for number, change in zip(geometry, changes, strict=True):
-            number.vary(trial, float(np.clip(FAR * number.deviation * change, *number.changes)))
+        for (number, far), change in zip(geometry, changes, strict=True):
+            number.vary(trial, far * number.deviation * float(change))
         return trial
 
     def rolled(trial: ModelNumbers) -> tuple[FloatArray, float]:
@@ -69,6 +70,8 @@ def seeming_numbers(
         contradiction, motion = rolled(changed(changes))
         return np.concatenate([contradiction.ravel() * (usual / motion / slip), changes])
 
-    found = optimize.least_squares(errors, np.zeros(len(geometry)), loss="soft_l1", x_scale=0.1, max_nfev=20)
+    found = optimize.least_squares(
+        errors, np.zeros(len(geometry)), bounds=(-1.0, 1.0), loss="soft_l1", x_scale=0.1, max_nfev=20
+    )
     seeming = changed(found.x)
     return seeming if before - part(seeming) > LEAST_PART else numbers
