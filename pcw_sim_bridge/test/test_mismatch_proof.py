@@ -31,7 +31,7 @@ from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
 from pcw_sim_bridge.mismatch.open_set import Leftover
 from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
 from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot, winds_up
-from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Channel, RegressionProblem, Term
+from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Channel, Nuisance, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
 from pcw_sim_bridge.mismatch.rollout import HORIZONS, Windows
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -524,6 +524,15 @@ def test_an_effect_is_no_patch_without_numbers_that_it_needs(astray: bool) -> No
     prover._prediction = functools.partial(Prover._prediction, prover)
     assert bool(prover.untuned) is astray
     assert (Prover._no_better(prover, explanation, held_out) is not None) is astray  # type: ignore[arg-type]
+
+
+def test_a_number_goes_into_the_patch_no_farther_than_makes_sense() -> None:
+    """Of tyres like stone a first order makes harder ones still, down to nothing that gives way."""
+    number = Nuisance("contact.stiffness", "1", 1.0, 0.5, np.zeros((1, 1)), (-0.75, 3.0), loose=True)
+    fit = SimpleNamespace(mean=np.array([-0.92]), covariance=np.array([[1e-4]]), scale=1.0)
+    search = SimpleNamespace(problem=SimpleNamespace(nuisances=(number,), scale_deviation=0.0))
+    found = analysis._reported_numbers(SimpleNamespace(search=search, fit=fit))  # type: ignore[arg-type]
+    assert found == {"contact.stiffness": 0.25}
 
 
 def helped_by(numbers: Sequence[SimpleNamespace]) -> SimpleNamespace:

@@ -706,6 +706,11 @@ def test_a_push_may_have_come_in_one_recording_alone(tmp_path: Path, healthy: Re
     assert left["with"][1] < 0.5 * left["without"][1]
 
 
+def identified(*effects):
+    """What a robot with some effects records while it is excited as for an identification."""
+    return simulate(World(THESIS, THESIS, "reduced"), Run("run", "identification", 15.0, 3), effects)
+
+
 def test_steerings_that_rub_leave_tyres_off_the_peak_of_their_friction():
     """As forces of the ground their torques would use up its friction, and six samples of ten not be judged."""
     rubbing = EffectInstance("steer_coulomb_friction", THESIS.caster_names, {"coulomb": 4.5})
@@ -723,11 +728,6 @@ def test_steerings_that_rub_leave_tyres_off_the_peak_of_their_friction():
     here = problem.valid[:, 0]
     assert np.linalg.norm((problem.residual - 4.5 * column - exact)[here]) < 0.02 * np.linalg.norm(problem.residual[here])
     assert np.linalg.norm(exact[here, :3]) < 0.1 * np.linalg.norm(problem.residual[here, :3])
-
-
-def identified(*effects):
-    """What a robot with some effects records while it is excited as for an identification."""
-    return simulate(World(THESIS, THESIS, "reduced"), Run("run", "identification", 15.0, 3), effects)
 
 
 def test_a_steering_that_is_turned_is_no_slide():

@@ -72,7 +72,7 @@ def test_weak_motors_and_heavy_loads_are_no_units(plain):
 
 
 def test_steerings_that_rub_are_no_units(plain):
-    """Nearly all of their torque they need for themselves: "7 times what moves the robot"."""
+    """Nearly all of their torque they need for themselves, which may look like torques in other units."""
     rubbing = EffectInstance("steer_coulomb_friction", THESIS.caster_names, {"coulomb": 4.5})
     assert found(THESIS, recorded(THESIS, [rubbing]))[0] is None
 
