@@ -7,16 +7,16 @@ not proposed; nor is one with which the simulation follows less well than withou
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
 from pcw_description.effects.kinds import TransmissionEffect
 from pcw_description.effects.registry import also_known, get
 
+from .all_cores import on_all_cores
 from .errors import MismatchError
 from .explanation import AMBIGUOUS, Explanation
 from .findings import REFUSED, ChannelProof, FitFinding, LadderFinding, RolloutProof
@@ -394,7 +394,8 @@ class Prover:
         """Mean squared relative errors (H, S) that noise alone makes in the patched description, or without one effect."""
         windows, mean = self._quiet_windows(explanation), held_out.means(without).mean(axis=0)
         assert windows is not None
-        with self._patched(explanation.search.problem, held_out, mean, self._numbers(explanation), without) as model:
+        with also_known(self.laws.effects):
+            model = self._patched(explanation.search.problem, held_out, mean, self._numbers(explanation), without)
             right = model if self._is_patched(explanation) else self.subject
             squares = windows.relative(right.rollout_floor(windows, self.rng))
         noise: FloatArray = np.nansum(squares, axis=0) / np.maximum(np.isfinite(squares).sum(axis=0), 1)
@@ -424,17 +425,20 @@ class Prover:
             return None
         if not self._is_patched(explanation):
             return self.before
-        fold = _fold_of(held_out, self.windows)
+        windows, fold = self.windows, _fold_of(held_out, self.windows)
         after = np.full_like(self.before, np.nan)
-        retuned = self._numbers(explanation)
-        for number, mean in enumerate(held_out.means(without)):
-            own = fold == number
-            if own.any():
-                with self._patched(explanation.search.problem, held_out, mean, retuned, without) as model:
-                    after[own] = model.rollout(self.windows.take(own))
+        problem, retuned = explanation.search.problem, self._numbers(explanation)
+
+        def simulated(number: int) -> FloatArray:
+            model = self._patched(problem, held_out, means[number], retuned, without)
+            return model.rollout(windows.take(fold == number))
+
+        numbers, means = np.unique(fold).tolist(), held_out.means(without)
+        with also_known(self.laws.effects):
+            for number, squares in zip(numbers, on_all_cores(simulated, numbers), strict=True):
+                after[fold == number] = squares
         return after
 
-    @contextlib.contextmanager
     def _patched(
         self,
         problem: RegressionProblem,
@@ -442,8 +446,8 @@ class Prover:
         mean: FloatArray,
         retuned: Mapping[str, float],
         without: int | None,
-    ) -> Iterator[Subject]:
-        """The description with the effects, laws and numbers of one fold; simulators know the laws as long as it is used."""
+    ) -> Subject:
+        """The description with the effects, laws and numbers of one fold, for a simulator that knows the laws."""
         effects = []
         changes = dict(zip((n.name for n in problem.nuisances), mean.tolist(), strict=False))
         for index in held_out.proposed:
@@ -470,8 +474,7 @@ class Prover:
             for n, change in zip(problem.nuisances, mean, strict=False)
             if n.name in retuned
         }
-        with also_known(self.laws.effects):
-            yield self.subject.patched(effects, numbers)
+        return self.subject.patched(effects, numbers)
 
     # -- what is said -----------------------------------------------------------------------------------------------
 

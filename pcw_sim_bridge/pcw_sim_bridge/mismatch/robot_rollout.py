@@ -15,6 +15,7 @@ from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER, RobotDes
 
 from ..plants.reduced import ReducedPlant, WindowStarts
 from ..plants.true_robot import as_it_really_is
+from .all_cores import on_all_cores
 from .regression_problem import FloatArray, IntArray
 from .robot_channels import STILL_SPEED, sliding
 from .robot_effects import ChannelModel, true_motion, with_pose
@@ -25,7 +26,7 @@ from .rolling_model import (
     rigid_motions,
     rolling_state,
     slip_ratios,
-    slips,
+    slips_of_ratios,
     twists,
     weights_on_steerings,
 )
@@ -216,11 +217,13 @@ def rollout_squares(robot: RobotDescription, windows: Windows, undescribed: Unde
         windows: of its recordings.
         undescribed: numbers that it does not hold.
     """
-    found = []
-    for part in windows.parts:
+
+    def squares(part: RobotPart) -> FloatArray:
         ends, _ = part.ends()
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
-        found.append(_squares(_simulated(robot, part, undescribed) - seen))
+        return _squares(_simulated(robot, part, undescribed) - seen)
+
+    found = on_all_cores(squares, windows.parts)
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 
@@ -292,9 +295,10 @@ def _rolling(robot: RobotDescription, numbers: ModelNumbers, motion: RobotMotion
     layout = ChannelLayout(robot.caster_names, balanced=True, imu=False, pose=False)
     state = rolling_state(motion, numbers, layout, ChannelModel(robot, numbers, layout).around(motion))
     wheels, slow = state.wheels, SignalFilter(motion.rate, FASTEST_SLIP)
-    slip = slips(numbers, motion.rate, wheels, state.force, state.grip)
+    ratio = slip_ratios(numbers.tyres, state.force, state.grip)
+    slip = slips_of_ratios(numbers, motion.rate, wheels, ratio)
     slip_twist, _ = rigid_motions(numbers, wheels.steer_angle, wheels.direction, slip, wheels.offset)
-    relaxed = numbers.tyres[:, LENGTH, None] * slip_ratios(numbers.tyres, state.force, state.grip)
+    relaxed = numbers.tyres[:, LENGTH, None] * ratio
     return wheels.twist - slow.smooth(slip_twist), slow.smooth(relaxed)
 
 

@@ -623,6 +623,11 @@ def slips(
         ratio = StraightTyres.about(numbers, straight.force, straight.grip).ratios(force, grip)
     else:
         ratio = slip_ratios(numbers.tyres, force, grip)
+    return slips_of_ratios(numbers, rate, wheels, ratio)
+
+
+def slips_of_ratios(numbers: ModelNumbers, rate: float, wheels: WheelMotion, ratio: FloatArray) -> FloatArray:
+    """Slip velocities (T, n, 2) [m/s] of rolling tyres whose forces ask for slip ratios (T, n, 2) where nothing changes."""
     ratio = numbers.softness * ratio
     ratio -= numbers.damping_time * derivative(ratio, rate)
     result: FloatArray = wheels.speed[:, :, None] * ratio

@@ -13,6 +13,7 @@ import dataclasses
 import math
 
 import numpy as np
+from scipy import optimize
 
 from pcw_description.recording import JointSeries, Recording
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
@@ -25,6 +26,7 @@ TORQUE_CONSTANT = "torque_constant_error"
 FRICTIONS = ("drive_coulomb_friction", "drive_viscous_friction", "steer_coulomb_friction", "steer_viscous_friction")
 # Factors have to explain this part of the square of what forces leave of the description.
 EXPLAINED = 0.9
+WORSE = 0.5  # times what likely factors leave, root mean square, is what others may leave
 # Within these bounds a factor is a weak motor, or a heavy load.
 LIKELY = (0.25, 4.0)
 NEAR = 0.15  # of a known factor
@@ -94,13 +96,13 @@ def torque_units(robot: RobotDescription, problem: RegressionProblem) -> TorqueU
 
 def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | None:
     """Factors of all drives' and all steerings' torques that move the robot as it moves (2,); None where they say little."""
-    of_all = [term for term in problem.terms if term.target == robot.caster_names]
-    both = [term for axis in AXIS_NAMES for term in of_all if term.effect == TORQUE_CONSTANT and term.axis == axis]
-    rubbing = [term for term in of_all if term.effect in FRICTIONS]
+    of_all = [term for term in problem.terms if term.target == robot.caster_names and term.effect == TORQUE_CONSTANT]
+    both = [term for axis in AXIS_NAMES for term in of_all if term.axis == axis]
+    rubbing = [term for term in problem.terms if len(term.target) == 1 and term.effect in FRICTIONS]
     force = [c for c, channel in enumerate(problem.channels) if channel.name.startswith("chassis_")]
     if len(both) != len(AXIS_NAMES) or not force:
         return None
-    # Steerings that rub need many times the torque that moves the robot, and are no steerings in other units.
+    # Joints that rub, one or all, need many times the torque that moves the robot, and are no joints in other units.
     parts = [term.columns(term.shapes[0])[:, :, list(term.base_indices())] for term in (*both, *rubbing)]
     columns = np.concatenate(parts, axis=2)
     rows, left = [], []
@@ -115,12 +117,22 @@ def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | 
     if not rows:
         return None
     design, wanted = np.concatenate(rows), np.concatenate(left)
+    # Torques that hardly move the robot could be many times themselves: what counts is what no likely factor explains.
+    likely = np.tile([[-np.inf], [np.inf]], design.shape[1])
+    likely[:, : len(both)] = np.array(LIKELY)[:, None] - 1.0
     errors = np.linalg.lstsq(design, wanted, rcond=None)[0]
-    remaining = wanted - design @ errors
-    if remaining @ remaining > (1.0 - EXPLAINED) * (wanted @ wanted):
+    within = optimize.lsq_linear(design, wanted, likely).x
+    allowed = min((1.0 - EXPLAINED) * (wanted @ wanted), WORSE**2 * _left(design, wanted, within))
+    if _left(design, wanted, errors) > allowed:
         return None
-    gains: FloatArray = 1.0 + errors[: len(AXIS_NAMES)]
+    gains: FloatArray = 1.0 + errors[: len(both)]
     return gains
+
+
+def _left(design: FloatArray, wanted: FloatArray, sizes: FloatArray) -> float:
+    """What columns of some sizes leave of what they are to explain: the sum of squares."""
+    remaining = wanted - design @ sizes
+    return float(remaining @ remaining)
 
 
 def _common_gear(robot: RobotDescription, axis: int) -> float:
