@@ -84,6 +84,15 @@ def test_one_joint_that_rubs_is_no_unit(effect):
     assert found(THESIS, recorded(THESIS, [rubbing], "figure8", 30.0))[0] is None
 
 
+def test_torques_lost_in_a_joint_are_no_unit(plain):
+    """A motor that works against its own cogs: no factor makes a torque of that which moves the robot."""
+    joints = plain.joint_states
+    effort = joints.effort.copy()
+    effort[:, 0, 1] += 10.0 * np.sin(19.0 * joints.position[:, 0, 1])
+    cogging = dataclasses.replace(plain, joint_states=dataclasses.replace(joints, effort=effort))
+    assert found(THESIS, cogging)[0] is None
+
+
 def test_motors_behind_coupled_gears_are_told_and_left(plain):
     """A turning steering turns the drive motor too: no factor makes torques at the joints of theirs."""
     units, _ = found(TIDYBOT, recorded(TIDYBOT), np.array([1.0 / 8.14, 1.0 / 12.8]))
