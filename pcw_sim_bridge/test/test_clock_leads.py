@@ -12,7 +12,8 @@ from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.clock_leads import FIRST_ORDER, clock_leads
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, wheels_slide
+from pcw_sim_bridge.simulate import main as simulate
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
@@ -41,12 +42,24 @@ def test_leads_are_found_where_first_orders_say_nothing_of_them(tmp_path: Path, 
     """To within the steps of the motion; what first orders tell is left to them."""
     recording = Recording.open(recorded(tmp_path / "run", inertial, tracked, 3, 16.0), THESIS)
     builder = RobotProblemBuilder(THESIS, [recording])
-    leads = clock_leads(builder.motions, builder.numbers)
+    leads = clock_leads(builder.motions, builder.numbers, [np.zeros(len(m.time), dtype=bool) for m in builder.motions])
     least = FIRST_ORDER / max(motion.cutoff for motion in builder.motions)
     wanted = [lead if abs(lead) > least else 0.0 for lead in (inertial, tracked)]
     assert 0.01 < least < 0.1
     assert leads == pytest.approx(wanted, abs=0.015)
     assert [lead == 0.0 for lead in leads] == [lead == 0.0 for lead in wanted]
+
+
+def test_a_robot_behind_wheels_that_spin_has_no_late_tracker(tmp_path: Path) -> None:
+    """Its velocity loops ask for steps: the wheels are there at once, and the robot comes after as friction lets it."""
+    path = tmp_path / "run"
+    steps = ["--excite", "steps", "--duration", "20", "--controller", "velocity_loops", "--seed", "1"]
+    assert simulate(["--robot", "xr4000", *steps, "--out", str(path)]) == 0
+    xr4000 = load_robot("xr4000")
+    builder = RobotProblemBuilder(xr4000, [Recording.open(path, xr4000)])
+    slides = [wheels_slide(builder.numbers, motion, builder.layout) for motion in builder.motions]
+    assert clock_leads(builder.motions, builder.numbers, [np.zeros_like(rows) for rows in slides])[1] > 0.02
+    assert not clock_leads(builder.motions, builder.numbers, slides).any()
 
 
 @pytest.mark.nightly  # a whole analysis, like that of others here

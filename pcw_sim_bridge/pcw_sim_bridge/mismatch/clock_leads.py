@@ -23,18 +23,20 @@ CLEARLY = 0.7  # of what a sensor has besides the motion of the wheels a shift l
 SHORTEST_PIECE = 4.0 * LONGEST_LEAD  # [s]; of a shorter one too little is left beside such a shift
 
 
-def clock_leads(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> FloatArray:
+def clock_leads(motions: Sequence[RobotMotion], numbers: ModelNumbers, sliding: Sequence[BoolArray]) -> FloatArray:
     """Return by how much the stamps of IMU and tracker are ahead of the joints' (2,) [s]; zero where first orders tell.
 
     Args:
         motions: true motions, as far as the description knows.
         numbers: of the model.
+        sliding: rows (T,) of every motion in which wheels do not say how the robot moves.
     """
     inertial, tracked = [], []
-    for motion in motions:
+    for motion, slides in zip(motions, sliding, strict=True):
         if motion.time[-1] - motion.time[0] < SHORTEST_PIECE:
             continue
         twist = twists(numbers, numbers.headings(motion.position), motion.velocity)[0]
+        twist[slides] = np.nan
         felt = acceleration_of(twist, derivative(twist, motion.rate))
         inertial.append((motion.rate, motion.imu, np.column_stack([twist[:, 2], felt[:, :2]])))
         tracked.append((motion.rate, motion.tracked_twist, at_place(twist, numbers.tracked)))

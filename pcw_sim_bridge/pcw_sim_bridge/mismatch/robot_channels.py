@@ -183,7 +183,9 @@ class RobotProblemBuilder:
     @functools.cached_property
     def _prepared(self) -> Prepared:
         """What candidates are made from: with clocks and torques put right that would be taken for something else."""
-        self._leads = clock_leads(self.motions, self.numbers)
+        # Behind wheels that spin a robot is late; clocks that are late themselves must not tell that they do.
+        slipping = [wheels_slide(self.numbers, motion, self.layout) for motion in self.motions]
+        self._leads = clock_leads(self.motions, self.numbers, slipping)
         if self._leads.any():
             self.motions = self._motions_of(self.model, leads=self._leads)
         if self.layout.balanced:
@@ -459,7 +461,15 @@ def allowed_slip(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
 
 def sliding(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -> BoolArray:
     """Return the rows (T,) of a motion in which wheels slide, shake, or use so much friction that their slip is open."""
-    bad = slipping(numbers, motion, layout)
+    return slipping(numbers, motion, layout) | wheels_slide(numbers, motion, layout)
+
+
+def wheels_slide(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) -> BoolArray:
+    """Return the rows (T,) of a motion in which wheels slide, or nearly so, by what joints alone say."""
+    bad = np.zeros(len(motion.time), dtype=bool)
+    if layout.redundant:
+        twist, contradiction = twists(numbers, numbers.headings(motion.position), motion.velocity)
+        bad |= np.max(np.linalg.norm(contradiction, axis=2), axis=1) > allowed_slip(numbers, twist)
     if layout.balanced:
         bad |= used_friction(numbers, rolling_state(motion, numbers, layout)) > USED_PART
     return bad

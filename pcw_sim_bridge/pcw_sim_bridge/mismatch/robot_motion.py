@@ -50,6 +50,19 @@ class LostTorque:
 
 
 @dataclasses.dataclass(frozen=True)
+class TorqueError:
+    """What is wrong with the torques of a motion, see `torque_errors`; no lever multiplies it.
+
+    Attributes:
+        torque: the part of those reported (T, n, 2) [N m].
+        wrench: on the base, by the described geometry (T, 3) [N, N, N m].
+    """
+
+    torque: FloatArray
+    wrench: FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
 class RobotMotion:
     """One contiguous piece on a regular grid after the wide filter; arrays along T.
 
@@ -70,6 +83,7 @@ class RobotMotion:
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
         shaking: speed at which the contacts of wheels shake that the filter smooths away (T,) [m/s]; its frequency [Hz].
         lost: what joints seem to lose; None where that matters little, or nobody has looked.
+        error: of the torques; None where nobody has looked.
     """
 
     recording: int
@@ -92,6 +106,7 @@ class RobotMotion:
     shaking: FloatArray
     shaking_frequency: float
     lost: LostTorque | None = None
+    error: TorqueError | None = None
 
     def without_lost(self) -> RobotMotion:
         """Return the motion with the torques that reach the ground."""

@@ -851,7 +851,7 @@ def rolling_state(
                 numbers.modules, numbers.steer_axis, offset, wheels.radius, direction, velocity, motion.acceleration,
                 torque + added, spin, twist, felt, wheels.normal, wheels.tilt,
             )
-            for torque in (motion.torque, motion.quiet_torque)
+            for torque in (motion.torque - (0.0 if motion.error is None else motion.error.torque), motion.quiet_torque)
         )  # fmt: skip
         if around.climb is not None:
             force = force - around.climb
@@ -898,9 +898,8 @@ def channel_sides(
     leaning = _leaning(numbers, motion.rate, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
-        measured.append(
-            _wrench_of(numbers.steer_axis, wheels.offset, wheels.direction, state.load, state.spin)
-        )
+        base = _wrench_of(numbers.steer_axis, wheels.offset, wheels.direction, state.load, state.spin)
+        measured.append(base if motion.error is None else base + motion.error.wrench)
         wrench = inertial_wrench(numbers, motion, wheels.direction, twist, twist_dot)
         if leaning is not None:
             wrench[:, :2] -= numbers.total_mass * derivative(derivative(leaning, motion.rate), motion.rate)

@@ -12,6 +12,9 @@ J being what torques add to force and moment. From r goes first what holds no to
 instruments of two-stage least squares, by which a number is found that is a factor of something measured. Lengths are none:
 a lever multiplies the torque, and its errors with it. What depends on how a robot moves may be physics that is missing.
 Reports of torques may be wrong in that way, commands are not, and there only what fluctuates faster is taken for an error.
+
+Nor do levers multiply what fluctuates faster: of a robot that drives straight ahead the steerings report noise alone, and
+casters that are longer by the half would make a third less of it. The wrench of those errors stays that of the description.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from scipy import interpolate, ndimage
 from .channel_differences import ChannelDifferences
 from .noise_model import channel_deviations
 from .regression_problem import BoolArray, FloatArray, Nuisance
-from .robot_motion import RobotMotion
+from .robot_motion import RobotMotion, TorqueError
 
 FORCES = slice(0, 3)  # channels of the balance
 INSTRUMENTS = ("chassis.", "module.", "wheel.inertia", "rotors.", "suspension.", "ground.")  # of those without torques
@@ -34,13 +37,13 @@ RIDGE = 1e-6  # of what a number explains, so that numbers which are the same th
 SLOW = 0.4  # [s]; errors fluctuate faster than robots move, and than most of what depends on how they move
 FLUCTUATES = 0.75  # of the part that is faster in white errors; of what holds less of it, missing physics is a part
 LEAST_STAMPS = 2  # of a piece; between one and none there is nothing to interpolate
-LEAST_ROWS = 200  # of the balance; fewer tell no errors from masses and frictions
+LEAST_ROWS = 60  # of the balance; fewer tell no errors from masses and frictions
 
 
 def with_balanced_torques(
     read: Sequence[RobotMotion], differences: ChannelDifferences, valid: BoolArray, instruments: Sequence[Nuisance]
 ) -> list[RobotMotion]:
-    """Return motions whose `balanced_torque` fits them.
+    """Return motions whose `balanced_torque` fits them, and whose errors are known.
 
     Args:
         read: the motions as they were read; differences: their channels under the description.
@@ -61,15 +64,26 @@ def with_balanced_torques(
             continue
         here = slice(start, start + len(stamps))
         rows, start = left[here], start + len(stamps)
-        if not motion.reported.any():
-            rows = rows * _fluctuates(rows, usable[here], own.decimated_rate)
-        there = there.reshape(len(stamps), 3, -1)
-        plain = there @ there.swapaxes(1, 2)
-        plain += 1e-9 * np.trace(plain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        errors = there.swapaxes(1, 2) @ np.linalg.solve(plain, rows[:, :, None])
-        along = interpolate.CubicSpline(stamps, errors[:, :, 0])(np.clip(motion.time, stamps[0], stamps[-1]))
-        found.append(dataclasses.replace(motion, balanced_torque=motion.quiet_torque - along.reshape(motion.torque.shape)))
+        fluctuating = rows * _fluctuates(rows, usable[here], own.decimated_rate)
+        balance = rows if motion.reported.any() else fluctuating
+        along, fast = (
+            interpolate.CubicSpline(stamps, _least_torques(there, part))(np.clip(motion.time, stamps[0], stamps[-1]))
+            for part in (balance, fluctuating)
+        )
+        error = motion.torque - motion.quiet_torque + fast
+        wrench = np.einsum("tcnj,tnj->tc", of_torque, error)
+        balanced = motion.quiet_torque - along
+        found.append(dataclasses.replace(motion, balanced_torque=balanced, error=TorqueError(error, wrench)))
     return found
+
+
+def _least_torques(of_torque: FloatArray, wrench: FloatArray) -> FloatArray:
+    """The torques (T, n, 2) of least squares that add wrenches (T, 3), by what torques add to these (T, 3, n, 2)."""
+    flat = of_torque.reshape(len(wrench), 3, -1)
+    plain = flat @ flat.swapaxes(1, 2)
+    plain += 1e-9 * np.trace(plain, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    torques = flat.swapaxes(1, 2) @ np.linalg.solve(plain, wrench[:, :, None])
+    return torques.reshape(len(wrench), *of_torque.shape[2:])
 
 
 def _fluctuates(left: FloatArray, usable: BoolArray, rate: float) -> BoolArray:
