@@ -613,11 +613,13 @@ class EffectSearch(SetGrowth):
                 if gain <= 0.0
                 else "below the details that remain"
                 if share < 1.0
-                else ""
-                if within
                 else "beyond its bounds"
-                for loss, gain, share, within in zip(
-                    losses, held_out, shares, regression.each_within_bounds(fit), strict=True
+                if not within
+                else ""
+                if finite
+                else "an infinite value does as well"
+                for loss, gain, share, within, finite in zip(
+                    losses, held_out, shares, regression.each_within_bounds(fit), regression.each_finite(fit), strict=True
                 )
             ]
             failing = [index for index, reason in enumerate(reasons) if reason and instances[index].term not in kept]

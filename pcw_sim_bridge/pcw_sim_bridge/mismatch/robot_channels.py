@@ -54,6 +54,7 @@ from .seeming_geometry import seeming_numbers
 from .signal_filter import SignalFilter
 from .sudden_slip import spinning, sudden_slip
 from .torque_errors import INSTRUMENTS, with_balanced_torques
+from .unresolved_motion import unresolved_rate
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
 SLIP_FLOOR, SLIP_PART = 0.03, 0.75
@@ -308,7 +309,7 @@ class RobotProblemBuilder:
     def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
         """What the model misjudges in each sample (T, C): slips, by a part of those there are, and what an IMU leans.
 
-        Besides what joints lose where their dry friction reverses.
+        Besides what joints lose where their dry friction reverses, and what encoders do not resolve.
         """
         found, predicted = np.zeros_like(differences.predicted), differences.predicted
         lost = [motion.lost for motion in differences.motions if motion.lost is not None]
@@ -316,13 +317,24 @@ class RobotProblemBuilder:
             predicted = predicted - differences.of_torque([own.torque[..., None] for own in lost])[:, :, 0]
         slips = predicted[:, self.layout.consistency]
         if slips.size:
-            found[:, self.layout.consistency] = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
+            misjudged = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
+            found[:, self.layout.consistency] = np.hypot(misjudged, self._unresolved())
         if self.layout.imu:
             found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
         if lost:
             doubts = [by_joint(own.doubt.reshape(len(own.doubt), -1, 1)) for own in lost]
             found = np.sqrt(found**2 + np.sum(differences.of_torque(doubts) ** 2, axis=2))
         return found
+
+    def _unresolved(self) -> FloatArray:
+        """By how much encoders miss what wheels do along and across (T, 2n) [m/s], a standard deviation."""
+        found = []
+        for motion, own in zip(self.motions, self.filters, strict=True):
+            drive, steer = np.moveaxis(unresolved_rate(motion.velocity, motion.resolution, self.cutoff), 2, 0)
+            offset = np.abs(self.numbers.caster_offset)
+            along = np.hypot(self.numbers.radius * drive, offset[:, 1] * steer)
+            found.append(own.decimate(np.stack([along, offset[:, 0] * steer], axis=2).reshape(len(motion.time), -1)))
+        return np.concatenate(found)
 
     def _seeming_numbers(self, differences: ChannelDifferences) -> ModelNumbers:
         """The numbers by which wheels slide least."""

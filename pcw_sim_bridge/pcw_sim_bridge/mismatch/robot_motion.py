@@ -15,6 +15,7 @@ from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
 from .held_commands import held_speeds, quiet_torque
 from .regression_problem import BoolArray, FloatArray
 from .signal_filter import SignalFilter, derivative, interpolated, uniform_segments, white_noise_level
+from .unresolved_motion import resolution
 from .wheel_shaking import wheel_shaking
 
 LARGEST_CUTOFF = 20.0  # [Hz]; above it structure and suspension answer
@@ -68,7 +69,7 @@ class RobotMotion:
 
     Attributes:
         rate: [Hz]; cutoff: of the wide filter [Hz].
-        sampling: interval of joint_states [s].
+        sampling: interval of joint_states [s]; resolution: of the joints' encoders (n, 2) [rad].
         position, velocity, acceleration, torque: joints (T, n, 2).
         quiet_torque: the torque without the noise of its measurement, as far as that can be had (T, n, 2); torque_rate: its
             rate.
@@ -90,6 +91,7 @@ class RobotMotion:
     rate: float
     cutoff: float
     sampling: float
+    resolution: FloatArray
     time: FloatArray
     position: FloatArray
     velocity: FloatArray
@@ -144,7 +146,7 @@ def read_motions(
     speed = joints.velocity if joints.velocity is not None else np.full_like(joints.position, np.nan)
     signals = np.concatenate([signals, quiet.reshape(-1, 2 * n), speed.reshape(-1, 2 * n), wanted.reshape(-1, 2 * n)], axis=1)
     rate, pieces = uniform_segments(joints.stamp, signals, LARGEST_GAP)
-    wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
+    wide, steps = SignalFilter(rate, PREFILTER_RATIO * cutoff), resolution(robot, joints.position)
     step = max(1, int(rate / (MOTION_OVERSAMPLING * wide.cutoff)))
     for stamps, values in pieces:
         needed = 4 * n if with_torque else 2 * n
@@ -178,6 +180,7 @@ def read_motions(
                     rate=rate / step,
                     cutoff=wide.cutoff,
                     sampling=1.0 / rate,
+                    resolution=steps,
                     time=stamps[start:stop][keep].copy(),
                     position=position[keep].copy(),
                     velocity=velocity[keep].copy(),

@@ -30,6 +30,7 @@ WORSE = 0.5  # times what likely factors leave, root mean square, is what others
 # Within these bounds a factor is a weak motor, or a heavy load.
 LIKELY = (0.25, 4.0)
 NEAR = 0.15  # of a known factor
+LOST = 0.7  # of what is left without torques at all; if they leave no less, nothing tells by what factor they act
 LEAST_PART = 0.2  # of the samples that can be judged
 KINDS = dict(zip(AXIS_NAMES, ("drives", "steerings"), strict=True))
 
@@ -129,7 +130,7 @@ def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | 
     for k in range(len(both)):
         # Torques that do nothing to the robot at all are lost in their joints, whatever their units.
         lost, others = wanted + design[:, k], np.delete(design, k, axis=1)
-        if left > WORSE**2 * _left(others, lost, np.linalg.lstsq(others, lost, rcond=None)[0]):
+        if left > LOST * _left(others, lost, np.linalg.lstsq(others, lost, rcond=None)[0]):
             gains[k] = 1.0
     return gains
 

@@ -37,6 +37,7 @@ CURVED_ROOM = 2.0
 TRIED_BYTES = 2**26  # of columns of shapes that were only tried
 TOGETHER = 40  # shapes whose columns are whitened in one go
 Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
+FINITE = 2.0  # deviations, by which an inverse has to be told from zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -575,6 +576,24 @@ class WhitenedRegression:
             )
             position += len(instance.active)
         return within
+
+    def each_finite(self, fit: Fit) -> list[bool]:
+        """Whether the value of every reciprocal parameter is told from an infinite one, per instance.
+
+        A tyre of which all slip is missing that it is described to have is no tyre of infinite stiffness: no force was there.
+        """
+        position, finite, variances = self.nuisance.shape[1], [], None
+        for instance in fit.instances:
+            told = True
+            for k, parameter in enumerate(self.problem.terms[instance.term].parameters[i] for i in instance.active):
+                if parameter.reciprocal and math.isfinite(parameter.origin) and parameter.origin != parameter.pole:
+                    if variances is None:
+                        variances = np.maximum(np.diag(fit.covariance), np.diag(self.misfit_covariance(fit)))
+                    low = fit.mean[position + k] - FINITE * math.sqrt(variances[position + k])
+                    told &= bool(low > parameter.coefficient(math.inf))
+            finite.append(told)
+            position += len(instance.active)
+        return finite
 
     def with_shape(self, instance: Instance, shape: Shape) -> Instance:
         """Return the instance with another shape."""
