@@ -79,7 +79,7 @@ def test_steerings_that_rub_are_no_units(plain):
 
 @pytest.mark.parametrize("effect", ["drive_coulomb_friction", "steer_coulomb_friction"])
 def test_one_joint_that_rubs_is_no_unit(effect):
-    """On a plain path, the torques of steerings hardly move the robot: 13 times as large ones had seemed to explain as much."""
+    """On a plain path steerings hardly move the robot: torques 13 times too large had seemed to explain as much."""
     rubbing = EffectInstance(effect, ("front_left",), {"coulomb": 0.5})
     assert found(THESIS, recorded(THESIS, [rubbing], "figure8", 30.0))[0] is None
 
