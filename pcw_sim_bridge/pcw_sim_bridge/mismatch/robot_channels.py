@@ -63,6 +63,7 @@ GROSS = 3.0  # times that; a tracker or a gyro that parts from all wheels by so 
 USED_PART = 0.8
 # By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
 SLIP_DEVIATION = 0.3
+ROLLS_TRUE = 1e-5  # [m/s]; no wheel and no floor is so true that what wheels slip by less says anything
 TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
 ROUNDING = 1e-9  # of what wheels roll; contradictions below it are those of arithmetic
 SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
@@ -318,7 +319,8 @@ class RobotProblemBuilder:
         slips = predicted[:, self.layout.consistency]
         if slips.size:
             misjudged = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
-            found[:, self.layout.consistency] = np.hypot(misjudged, self._unresolved())
+            unknown = np.hypot(self._unresolved(), ROLLS_TRUE)
+            found[:, self.layout.consistency] = np.hypot(misjudged, unknown)
         if self.layout.imu:
             found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
         if lost:

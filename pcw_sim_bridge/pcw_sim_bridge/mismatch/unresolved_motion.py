@@ -43,15 +43,15 @@ def resolution(robot: RobotDescription, position: FloatArray) -> FloatArray:
 def unresolved_rate(velocity: FloatArray, resolution: FloatArray, cutoff: float) -> FloatArray:
     """Return by how much encoders miss the rates of joints (T, n, 2) [rad/s], a standard deviation.
 
-    A count has a variance of step^2 / 12, which is spread over the frequencies up to that at which counts are crossed, or
-    up to the cut-off if that is higher; the derivative of what of it is below the cut-off is left.
+    A count has a variance of step^2 / 12. Of a joint at rest all of it may be within the channels' filter, of which the
+    derivative is left; the faster counts are crossed, the less of it is.
 
     Args:
         velocity: of the joints (T, n, 2) [rad/s].
         resolution: of their encoders (n, 2) [rad].
         cutoff: of the channels' filter [Hz].
     """
-    step = np.maximum(resolution, 1e-300)
-    crossed = np.maximum(np.abs(velocity) / step, cutoff)
-    missed: FloatArray = resolution / math.sqrt(12.0) * math.tau * np.sqrt(cutoff**3 / 3.0 / crossed)
+    crossed = np.abs(velocity) / np.maximum(resolution, 1e-300)
+    at_rest = resolution / math.sqrt(12.0) * math.tau * cutoff / math.sqrt(3.0)
+    missed: FloatArray = at_rest * cutoff / np.maximum(crossed, cutoff)
     return missed
