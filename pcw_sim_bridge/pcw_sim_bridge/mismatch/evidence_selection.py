@@ -40,6 +40,7 @@ from .whitened_regression import Fit, Instance, WhitenedRegression
 ALIKE, MOST_ALIKE, FAR = 10.0, 3, 30.0
 # So many tolerances that a number has moved are far.
 FAR_MOVED = 2.0
+LONG_WAY = 20  # rounds in which a problem is made exact, from the description on
 # What stands in for an effect that a gate stops must be worth so much [nats]: of little, much is alike.
 LEAST_STAND_IN = 30.0
 # Waves of a floor are tried anew beside what was found: these lengths [m], and so many directions; the best few are refined.
@@ -127,7 +128,8 @@ class EffectSearch(SetGrowth):
                 break
         threshold = self.calibrate(regression, instances)
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
-        selection = self.against_alike(self.against_fewer(self.with_best_waves(self.gathered(selection))))
+        selection = self.with_best_waves(self.gathered(self.afresh(selection)))
+        selection = self.against_alike(self.against_fewer(selection))
         selection = self.with_one_look_alike(self.with_one_cause(selection))
         return self.with_outlines(self.bounded(self.retuned_away(selection)))
 
@@ -152,6 +154,24 @@ class EffectSearch(SetGrowth):
             if _terms(selection.fit.instances) == _terms(chosen):
                 break
         return selection
+
+    def afresh(self, selection: Selection) -> Selection:
+        """The same effects where the problem is exact at them from the description on, if that is the better place.
+
+        While other effects were tried numbers may have moved far, and the way back is barred by all that is curved.
+        """
+        fit = selection.fit
+        if not fit.instances or not self._is_strained(fit):
+            return selection
+        here, own = (self.problem, self._point), self._exact_evidence(selection.regression, fit)
+        self.problem, self._point = self.unexplained
+        regression = selection.regression.moved(self.problem)
+        gain = self._arrived(regression, regression.fit(fit.instances), LONG_WAY)[0] - own
+        if gain < STEADY_EVIDENCE:
+            self.problem, self._point = here
+            return selection
+        self.progress(f"the same from the description on: {gain:.1f} nats more")
+        return self.settle_on(self.conclude(fit.instances, selection.threshold), selection.threshold)
 
     def retuned_away(self, selection: Selection) -> Selection:
         """Drop effects that other numbers of the description stand in for as soon as the problem is exact at those.

@@ -200,8 +200,15 @@ class ExactProblem:
 
     def _reached(self, regression: WhitenedRegression, fit: Fit) -> tuple[float, FloatArray]:
         """The same, and the whitened residual there."""
-        here, reached, left = (self.problem, self._point), -math.inf, regression.whitened_residual(fit)
-        for _ in range(EXACT_ROUNDS):
+        here = self.problem, self._point
+        evidence, left = self._arrived(regression, fit, EXACT_ROUNDS)
+        self.problem, self._point = here
+        return evidence, left
+
+    def _arrived(self, regression: WhitenedRegression, fit: Fit, rounds: int) -> tuple[float, FloatArray]:
+        """The same, with the problem exact there afterwards."""
+        reached, left, place = -math.inf, regression.whitened_residual(fit), (self.problem, self._point)
+        for _ in range(rounds):
             if not self._exact_at(fit):
                 break
             self.problem = self.problem.derived()
@@ -213,7 +220,8 @@ class ExactProblem:
             there = promised - 0.5 * float(missing @ np.linalg.solve(fit.covariance, missing))
             if there > reached:
                 reached, left = there, regression.whitened_residual(dataclasses.replace(fit, mean=point))
+                place = self.problem, self._point
             if promised - there < STEADY_EVIDENCE:
                 break
-        self.problem, self._point = here
+        self.problem, self._point = place
         return (reached if math.isfinite(reached) else fit.log_evidence), left
