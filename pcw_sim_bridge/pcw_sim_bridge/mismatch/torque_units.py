@@ -119,18 +119,18 @@ def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | 
         return None
     design, wanted = np.concatenate(rows), np.concatenate(left)
     errors = np.linalg.lstsq(design, wanted, rcond=None)[0]
-    left = _left(design, wanted, errors)
+    remains = _left(design, wanted, errors)
     # Torques that hardly move the robot could be many times themselves: what counts is what no likely factor explains.
     likely = np.tile([[-np.inf], [np.inf]], design.shape[1])
     likely[:, : len(both)] = np.array(LIKELY)[:, None] - 1.0
     within = optimize.lsq_linear(design, wanted, likely).x
-    if left > min((1.0 - EXPLAINED) * (wanted @ wanted), WORSE**2 * _left(design, wanted, within)):
+    if remains > min((1.0 - EXPLAINED) * (wanted @ wanted), WORSE**2 * _left(design, wanted, within)):
         return None
     gains: FloatArray = 1.0 + errors[: len(both)]
     for k in range(len(both)):
         # Torques that do nothing to the robot at all are lost in their joints, whatever their units.
         lost, others = wanted + design[:, k], np.delete(design, k, axis=1)
-        if left > LOST * _left(others, lost, np.linalg.lstsq(others, lost, rcond=None)[0]):
+        if remains > LOST * _left(others, lost, np.linalg.lstsq(others, lost, rcond=None)[0]):
             gains[k] = 1.0
     return gains
 
