@@ -17,6 +17,7 @@ from pcw_sim_bridge.mismatch.challenge import cases, effect_size
 from pcw_sim_bridge.mismatch.challenge.cases import (
     KINDS,
     MASKINGS,
+    PLAIN_EXCITATIONS,
     effects_of,
     find_factor,
     order_cases,
@@ -391,6 +392,15 @@ def test_a_payload_costs_what_it_moves_of_mass_and_its_centre() -> None:
     payload = {"mass": 0.01 * chassis.mass, "x": chassis.com[0], "y": chassis.com[1], "z": chassis.com[2] + 1.0}
     cost = tolerated_cost(THESIS, effect_instance("payload_mass", ("chassis",), payload))
     assert cost == pytest.approx(0.5 * (1.0 + (1.0 / 1.01 / 100.0 / 0.005) ** 2))
+
+
+def test_some_healthy_robots_do_one_plain_manoeuvre_by_their_own_loops() -> None:
+    orders = order_cases(24, 2, kinds=("none",), plants=("reduced",), durations=(20.0, 21.0))
+    drawn = [prepare_case(order) for order in orders]
+    plain = [answer for answer in drawn if answer["controller"] == "velocity_loops"]
+    assert 0 < len(plain) < len(drawn)
+    assert {run["excitation"] for answer in plain for run in answer["runs"][:1]} <= {*PLAIN_EXCITATIONS, "identification"}
+    assert len({answer["runs"][0]["excitation"] for answer in plain}) > 2
 
 
 @pytest.mark.nightly

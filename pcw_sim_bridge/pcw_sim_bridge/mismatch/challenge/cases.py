@@ -46,6 +46,10 @@ PLANT_SHARES: Mapping[str, float] = {"reduced": 0.4, "pybullet": 0.3, "mujoco": 
 EXCITATION_SHARES: Mapping[str, float] = {
     "identification": 0.45, "chirps": 0.2, "random_goals": 0.15, "steps": 0.1, "figure8": 0.05, "strafe": 0.05,
 }
+# A part of these kinds is what users record: one plain manoeuvre, driven by the velocity loops of the drives. It says little of
+# what the robot did not do.
+PLAIN_KINDS, PLAIN_SHARE = ("none", "single"), 0.3
+PLAIN_EXCITATIONS = ("chirp_x", "chirp_y", "chirp_yaw", "circle", "creep", "figure8", "spin", "steps", "strafe")
 DURATIONS = (30.0, 60.0)  # [s]
 SHORTEST_RUN, LONGEST_RUN = 15.0, 600.0  # [s]
 HOLDOUT_SHARE = 0.7  # the held-out recording may be shorter: it only tests
@@ -206,7 +210,8 @@ class _Drawing:
         self._base = draw_robot(rng, needs_imu=bool(NEEDS_IMU & set(order.effects)))
         self._noise = _log_uniform(rng, *NOISE_RANGE)
         self._deviations = draw_deviations(self._base, rng)
-        controller = "velocity_loops" if order.masking == "closed_loop" else "computed_torque"
+        self._plain = order.kind in PLAIN_KINDS and rng.random() < PLAIN_SHARE
+        controller = "velocity_loops" if self._plain or order.masking == "closed_loop" else "computed_torque"
         true = _noisy(with_deviations(self._base, self._deviations), self._noise)
         self._world = World(self._base, true, order.plant, controller)
         self._fit = [self._run("recordings/run_1", self._excitation())]
@@ -256,6 +261,8 @@ class _Drawing:
         return Run(path, excitation, duration, seed, active)
 
     def _excitation(self) -> str:
+        if self._plain:
+            return str(self._rng.choice(PLAIN_EXCITATIONS))
         names = list(EXCITATION_SHARES)
         return str(self._rng.choice(names, p=list(EXCITATION_SHARES.values())))
 
