@@ -46,8 +46,8 @@ PLANT_SHARES: Mapping[str, float] = {"reduced": 0.4, "pybullet": 0.3, "mujoco": 
 EXCITATION_SHARES: Mapping[str, float] = {
     "identification": 0.45, "chirps": 0.2, "random_goals": 0.15, "steps": 0.1, "figure8": 0.05, "strafe": 0.05,
 }
-# A part of these kinds is what users record: one plain manoeuvre, driven by the velocity loops of the drives. It says little of
-# what the robot did not do.
+# A part of these kinds is what users record: one plain manoeuvre, driven by the velocity loops of the drives. It says little
+# of what the robot did not do.
 PLAIN_KINDS, PLAIN_SHARE = ("none", "single"), 0.3
 PLAIN_EXCITATIONS = ("chirp_x", "chirp_y", "chirp_yaw", "circle", "creep", "figure8", "spin", "steps", "strafe")
 DURATIONS = (30.0, 60.0)  # [s]
