@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from pcw_description.recording import Recording
 from pcw_description.robot_description import RobotDescription
@@ -16,11 +16,10 @@ SAME_PART = 0.25
 LARGEST_GAP = 0.05  # [s]; an older command is not held any more
 SURE = 5.0  # deviations of chance, by which one way to read the stamps must be nearer to what was reported than another
 NOISE_BANDS = 10  # of all frequencies; the quietest holds no more than the noise
-WINDOW = 512  # samples, of which the spectrum is taken at a time
-# Of frequencies and of times that are averaged: few enough to see a motion, enough to see that there is none; and by how many
-# deviations of chance they have to be more than noise; cells that overlap have less to say each.
-SMOOTHED_CELLS, SURE_POWER = (9, 3), 5.0
-LEAST_SAMPLES = 250
+# Of a periodogram that are averaged: few enough to see a motion, enough to see that there is none; and by how many deviations
+# of chance they have to be more than noise.
+SMOOTHED_ORDINATES, SURE_POWER = 25, 3.0
+LEAST_SAMPLES = 10 * SMOOTHED_ORDINATES
 # A motor follows its commands if no more than this part of the noise is expected beyond them: so much chance leaves.
 NOISE_PART = 0.5
 # A shorter recording [s], such as what a running robot is judged by, is too little to tell a motor that lags from noise: there
@@ -129,10 +128,9 @@ def _is_noise(rest: FloatArray) -> bool:
 def expected(values: FloatArray) -> FloatArray:
     """Return what a signal (T,) in white noise is expected to be without it, NaN where it is NaN.
 
-    The part of each frequency that is not noise, by Wiener's filter, at every time anew: a robot that drives on is quieter
-    than when it sets out. The noise is no more than what the quietest frequencies hold. What is regressed on it comes out in
-    its true size, where on the signal as it is it would come out too small by the noise's part: Carroll et al., Measurement
-    Error in Nonlinear Models, 2nd ed. (2006), chapter 4.
+    The part of each frequency that is not noise, by Wiener's filter; the noise is no more than what the quietest frequencies
+    hold. What is regressed on it comes out in its true size, where on the signal as it is it would come out too
+    small by the noise's part: Carroll et al., Measurement Error in Nonlinear Models, 2nd ed. (2006), chapter 4.
     """
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < LEAST_SAMPLES:
@@ -140,11 +138,10 @@ def expected(values: FloatArray) -> FloatArray:
     rows = np.arange(len(values))
     whole = np.interp(rows, known, values[known])
     mirrored = np.concatenate([whole, whole[::-1]])  # without a step at the ends
-    length = min(WINDOW, len(mirrored))
-    _, _, cells = signal.stft(mirrored, nperseg=length, padded=True)
-    power = ndimage.uniform_filter(np.abs(cells) ** 2, SMOOTHED_CELLS, mode="nearest")
+    spectrum = np.fft.rfft(mirrored)
+    power = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, SMOOTHED_ORDINATES, mode="nearest")
     noise = min(float(np.median(band)) for band in np.array_split(power, NOISE_BANDS))
-    by_chance = 1.0 + SURE_POWER / np.sqrt(np.prod(SMOOTHED_CELLS))
+    by_chance = 1.0 + SURE_POWER / np.sqrt(SMOOTHED_ORDINATES)
     share = np.where(power > by_chance * noise, 1.0 - noise / np.maximum(power, 1e-300), 0.0)
-    _, quiet = signal.istft(cells * share, nperseg=length)
-    return np.where(np.isfinite(values), quiet[: len(values)], np.nan)
+    quiet: FloatArray = np.fft.irfft(spectrum * share, len(mirrored))[: len(values)]
+    return np.where(np.isfinite(values), quiet, np.nan)
