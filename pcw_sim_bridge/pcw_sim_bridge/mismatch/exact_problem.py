@@ -206,7 +206,7 @@ class ExactProblem:
         return evidence, left
 
     def _arrived(self, regression: WhitenedRegression, fit: Fit, rounds: int) -> tuple[float, FloatArray]:
-        """The same, with the problem exact there afterwards."""
+        """Log evidence and whitened residual of a set at the best of so many steps; the problem stays exact there."""
         reached, left, place = -math.inf, regression.whitened_residual(fit), (self.problem, self._point)
         for _ in range(rounds):
             if not self._exact_at(fit):

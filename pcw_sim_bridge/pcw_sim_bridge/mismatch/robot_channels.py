@@ -186,8 +186,8 @@ class RobotProblemBuilder:
     def _prepared(self) -> Prepared:
         """What candidates are made from: with clocks and torques put right that would be taken for something else."""
         # Behind wheels that spin a robot is late; clocks that are late themselves must not tell that they do.
-        slipping = [wheels_slide(self.numbers, motion, self.layout) for motion in self.motions]
-        self._leads = clock_leads(self.motions, self.numbers, slipping)
+        slides = [wheels_slide(self.numbers, motion, self.layout) for motion in self.motions]
+        self._leads = clock_leads(self.motions, self.numbers, slides)
         if self._leads.any():
             self.motions = self._motions_of(self.model, leads=self._leads)
         if self.layout.balanced:

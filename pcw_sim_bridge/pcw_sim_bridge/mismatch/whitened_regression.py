@@ -36,8 +36,8 @@ RETUNED_SHARE = 0.05
 CURVED_ROOM = 2.0
 TRIED_BYTES = 2**26  # of columns of shapes that were only tried
 TOGETHER = 40  # shapes whose columns are whitened in one go
-Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 FINITE = 2.0  # deviations, by which an inverse has to be told from zero
+Frozen = tuple[tuple[str, float], ...]  # a shape as the key of a dictionary
 
 
 @dataclasses.dataclass(frozen=True)
