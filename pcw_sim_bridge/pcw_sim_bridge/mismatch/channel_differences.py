@@ -9,8 +9,9 @@ import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
 
+from .joint_balance import JointResponse
 from .regression_problem import FloatArray
-from .robot_effects import ChannelModel, normal_along
+from .robot_effects import ChannelModel
 from .robot_motion import RobotMotion
 from .rolling_model import ModelNumbers, RollingState, StraightTyres, Surroundings, rolling_state
 from .signal_filter import SignalFilter
@@ -27,7 +28,8 @@ class ChannelDifferences:
         motions: true motions, each with a pose.
         filters: of the channels, one per motion.
         measured, predicted, residual: filtered, (T, C).
-        on_ground: how the wheels of each motion roll under the torques that reach the ground; straight: the tyres there.
+        on_ground: how the wheels of each motion roll under the torques that reach the ground; straight: the tyres there. Off
+            the ground there are no such states, and None for tyres.
     """
 
     def __init__(
@@ -35,7 +37,7 @@ class ChannelDifferences:
         model: ChannelModel,
         motions: Sequence[RobotMotion],
         filters: Sequence[SignalFilter],
-        straight: Sequence[StraightTyres] | None = None,
+        straight: Sequence[StraightTyres | None] | None = None,
     ) -> None:
         """Take the channels of true motions, each with a pose.
 
@@ -46,14 +48,19 @@ class ChannelDifferences:
         self.model, self.motions, self.filters = model, motions, filters
         self._states: list[RollingState] = []
         self._around: list[Surroundings] = []
-        self.normal = [normal_along(motion, model.numbers) for motion in motions]
+        self.normal = [model.normal_along(motion) for motion in motions]
         self.on_ground: list[RollingState] = []
-        self.straight: list[StraightTyres] = []
+        self.straight: list[StraightTyres | None] = []
         for index, (motion, normal) in enumerate(zip(motions, self.normal, strict=True)):
             around = model.around(motion)
+            if model.layout.lifted:  # nothing rolls
+                self._around.append(dataclasses.replace(around, normal=normal))
+                self.straight.append(None)
+                continue
             state = there = rolling_state(motion, model.numbers, model.layout, around)
             if motion.lost is not None:
                 there = rolling_state(motion.without_lost(), model.numbers, model.layout, around)
+            tyres: StraightTyres | None
             if straight is None:
                 tyres = StraightTyres.about(model.numbers, there.force, there.grip, in_place=motion.lost is not None)
             else:
@@ -70,7 +77,10 @@ class ChannelDifferences:
         sides = [(np.where(there, *both), both[1]) for there, both in zip(self.known, self._sides, strict=True)]
         self.measured, self.predicted = (self.filtered(pieces) for pieces in zip(*sides, strict=True))
         self.residual = self.measured - self.predicted
-        self._responses: list[TorqueResponse] | None = None
+        # Off the ground nothing rolls.
+        self._responses: list[JointResponse | TorqueResponse] | None = None
+        if model.layout.lifted:
+            self._responses = [JointResponse() for _ in motions]
 
     def filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         """Filter one array (T, ...) per motion and put them on end."""
@@ -136,9 +146,9 @@ class ChannelDifferences:
 
     def wrench_of_torque(self) -> list[FloatArray]:
         """What torques on the joints add to force and moment along each motion, (T, 3, n, 2)."""
-        return [response.wrench_of_torque for response in self._torque_responses()]
+        return [r.wrench_of_torque for r in self._torque_responses() if isinstance(r, TorqueResponse)]
 
-    def _torque_responses(self) -> list[TorqueResponse]:
+    def _torque_responses(self) -> list[JointResponse | TorqueResponse]:
         if self._responses is None:
             self._responses = [
                 TorqueResponse(motion, self.model.numbers, self.model.layout, state, around.straight)

@@ -48,6 +48,8 @@ from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
 AMBIGUOUS = 3.0
+# An effect of this part of the size that it had without a refinement was what that refinement is.
+NEXT_TO_NOTHING = 0.1
 # What a refinement of a named effect has to make up for against a further plain effect: the plain laws come first.
 REFINEMENT_LOG_PRIOR = -3.0
 # Half-width of 95 % of a Gaussian, in deviations.
@@ -525,11 +527,13 @@ def _still_needed(
 
 
 def _size_evidence(problem: RegressionProblem, fit: Fit, instance: Instance, size: FloatArray) -> float:
-    """Log odds that an instance is there, of about a given size (P,), against that it is not."""
+    """Log odds that an instance is there, of about a given size (P,), against that it is not; none where next to nothing is."""
     index = fit.instances.index(instance)
     start = len(problem.nuisances) + sum(len(other.active) for other in fit.instances[:index])
     rows = slice(start, start + len(instance.active))
     mean, covariance = fit.mean[rows], fit.covariance[rows, rows]
+    if np.all(np.abs(mean) + 2.0 * np.sqrt(np.diag(covariance)) < NEXT_TO_NOTHING * np.abs(size)):
+        return -math.inf
     wide = covariance + np.diag(np.maximum(size**2, 1e-300))
     odds = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(wide)[1]
     odds += mean @ (np.linalg.solve(covariance, mean) - np.linalg.solve(wide, mean))

@@ -262,7 +262,8 @@ def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -
     for channel in range(channels):
         coefficients, deviation = _autoregression(residual[:, channel], valid[:, channel], segment, order)
         slow = slow_power(residual[:, channel], valid[:, channel], segment)
-        filters.append(_whitening_taps(coefficients, deviation, slow))
+        whole = float(np.sum(residual[valid[:, channel], channel] ** 2))
+        filters.append(_whitening_taps(coefficients, deviation, slow, whole))
     length = max(len(taps) for taps in filters)
     length = max(1, min(length, longest // 4 + 1))
     taps = np.zeros((channels, length))
@@ -324,13 +325,16 @@ def slow_power(values: FloatArray, valid: BoolArray, segment: IntArray) -> float
     return sum(power * count for power, count in powers) / sum(count for _, count in powers)
 
 
-def _whitening_taps(coefficients: FloatArray, deviation: float, slow: float) -> FloatArray:
-    """Minimum-phase filter of 1 / S_w, with S_w the running maximum of `slow` and the autoregression's spectrum."""
+def _whitening_taps(coefficients: FloatArray, deviation: float, slow: float, whole: float) -> FloatArray:
+    """Minimum-phase filter of 1 / S_w, with S_w the running maximum of `slow` and the autoregression's spectrum.
+
+    No ordinate of a residual holds more than the `whole` sum of its squares, whatever an autoregression of smooth values says.
+    """
     polynomial = np.zeros(2 * _SPECTRUM_POINTS)
     polynomial[0] = 1.0
     polynomial[1 : len(coefficients) + 1] = -coefficients
     response = np.abs(np.fft.rfft(polynomial)) ** 2
-    spectrum = deviation**2 / np.maximum(response, 1e-12)
+    spectrum = np.minimum(deviation**2 / np.maximum(response, 1e-12), max(whole, deviation**2))
     rising = np.maximum.accumulate(np.maximum(spectrum, slow))
     # Minimum phase by the folded cepstrum.
     cepstrum = np.fft.irfft(-0.5 * np.log(rising))

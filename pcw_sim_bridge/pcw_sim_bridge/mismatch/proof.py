@@ -15,6 +15,7 @@ import numpy as np
 
 from pcw_description.effects.kinds import TransmissionEffect
 from pcw_description.effects.registry import also_known, get
+from pcw_description.errors import PcwError
 
 from .all_cores import on_all_cores
 from .errors import MismatchError
@@ -161,7 +162,7 @@ class Prover:
             self.laws = LawModels(explanation, refused)
             held_out = self._held_out(explanation)
             after = None
-            useless, simulated = self._useless(explanation, held_out), None
+            useless, simulated = self._impossible(explanation, held_out) or self._useless(explanation, held_out), None
             if useless is None:
                 after = self._rollout(explanation, held_out)
                 simulated = self._misleading(explanation, held_out, after)
@@ -340,6 +341,30 @@ class Prover:
             if work > AT_WORK and nats <= (-AMBIGUOUS if held_out.instances[index] in doubted else 0.0):
                 found.append((nats, index))
         return (min(found)[1], "the error is no smaller with it") if found else None
+
+    def _impossible(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
+        """An effect that makes a robot of the patch that cannot be: without it, or at least with it gone, that can."""
+        if self._can_be(explanation, held_out, None) or not held_out.proposed:
+            return None
+        guilty = [index for index in held_out.proposed if self._can_be(explanation, held_out, index)]
+        return (guilty or list(held_out.proposed))[0], "no robot can be so"
+
+    def _can_be(self, explanation: Explanation, held_out: HeldOut, without: int | None) -> bool:
+        """Whether there is such a robot, by all that was fitted and by every fold of it."""
+        problem, numbers = explanation.search.problem, self._numbers(explanation)
+        left_out = None if without is None else held_out.instances[without]
+        effects = [
+            effect_instance(n.term.effect, n.term.target, {k: e.value for k, e in n.estimates.items()}, n.term.axis)
+            for n in explanation.named if n.instance != left_out
+        ]
+        try:
+            self.subject.patched(effects, numbers)
+            with also_known(self.laws.effects):
+                for mean in held_out.means(without):
+                    self._patched(problem, held_out, mean, numbers, without)
+        except PcwError:
+            return False
+        return True
 
     def _misleading(
         self, explanation: Explanation, held_out: HeldOut, after: FloatArray | None

@@ -27,6 +27,7 @@ from .clock_leads import clock_leads
 from .errors import MismatchError
 from .first_look import Looked, remainder
 from .found_effect import effect_instance
+from .joint_balance import torque_of_motion
 from .lost_torques import by_joint, lost_torques
 from .regression_problem import (
     BoolArray,
@@ -39,7 +40,7 @@ from .regression_problem import (
     Term,
 )
 from .robot_effects import ChannelModel, true_motion, with_leads, with_pose
-from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, has_balance, read_motions
+from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, has_balance, has_torques, read_motions
 from .robot_nuisances import (
     FLOOR,
     MODEL_DEVIATION,
@@ -51,7 +52,7 @@ from .robot_nuisances import (
 from .robot_terms import robot_terms
 from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
 from .seeming_geometry import seeming_numbers
-from .signal_filter import SignalFilter
+from .signal_filter import SignalFilter, derivative
 from .sudden_slip import spinning, sudden_slip
 from .torque_errors import INSTRUMENTS, with_balanced_torques
 from .unresolved_motion import unresolved_rate
@@ -81,13 +82,16 @@ CLOCKS, CLOCK_NUMBERS = "clock_offset", ("offset", "tracker_offset")
 # Channels and what they differ by, which samples of them may be judged, and the numbers that a healthy robot may differ in.
 Prepared = tuple[ChannelDifferences, BoolArray, tuple[Nuisance, ...]]
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
+# The same of a joint that is judged by itself: slower [rad/s] for so long [s].
+HELD_SPEED, HELD_TIME = 0.05, 0.1
 
 
 class RobotProblemBuilder:
     """Builds the regression problem of a robot from its recordings."""
 
     def __init__(
-        self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None, live: bool = False
+        self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None, live: bool = False,
+        lifted: bool = False,
     ) -> None:
         """Filter the recordings.
 
@@ -96,21 +100,24 @@ class RobotProblemBuilder:
             recordings: opened with this robot.
             cutoff: of the channel filter [Hz]; None chooses it from the noise of the encoders.
             live: these are windows of a running robot, or what they are judged by: see `quiet_torque`.
+            lifted: the wheels were off the ground; see `joint_balance`.
 
         Raises:
-            MismatchError: no piece is long enough.
+            MismatchError: no piece is long enough; or off the ground, where torques are all there is, none were recorded.
         """
         self.robot = robot
-        balanced = has_balance(robot, recordings)
-        self.cutoff = cutoff if cutoff is not None else choose_cutoff(robot, recordings)
+        balanced = has_torques(recordings) if lifted else has_balance(robot, recordings)
+        if lifted and not balanced:
+            raise MismatchError("off the ground motors are all that can be judged; allowed: joint_states with effort")
+        self.cutoff = cutoff if cutoff is not None else choose_cutoff(robot, recordings, lifted)
         motions: list[RobotMotion] = []
         for index, recording in enumerate(recordings):
             motions += read_motions(robot, recording, index, self.cutoff, balanced, live)
         if not motions:
             raise MismatchError(f"no contiguous piece of at least {SHORTEST_SEGMENT:g} s in the recordings")
-        imu = any(np.isfinite(motion.imu).any() for motion in motions)
-        pose = any(np.isfinite(motion.tracked_twist).any() for motion in motions)
-        self.layout = ChannelLayout(robot.caster_names, balanced, imu, pose, len(robot.fixed_axle))
+        imu = any(np.isfinite(motion.imu).any() for motion in motions) and not lifted
+        pose = any(np.isfinite(motion.tracked_twist).any() for motion in motions) and not lifted
+        self.layout = ChannelLayout(robot.caster_names, balanced, imu, pose, len(robot.fixed_axle), lifted)
         # Numbers that effects in the description already change belong to the nominal model.
         described = as_it_really_is(robot)
         self.numbers = ModelNumbers.of(described)
@@ -185,6 +192,10 @@ class RobotProblemBuilder:
     @functools.cached_property
     def _prepared(self) -> Prepared:
         """What candidates are made from: with clocks and torques put right that would be taken for something else."""
+        if self.layout.lifted:  # no clock tells anything beside that of the joints, and what one of them loses no other brings
+            self._read = self._as_moved()
+            self.motions = self._motions_of(self.model)
+            return self._as_read()
         # Behind wheels that spin a robot is late; clocks that are late themselves must not tell that they do.
         slides = [wheels_slide(self.numbers, motion, self.layout) for motion in self.motions]
         self._leads = clock_leads(self.motions, self.numbers, slides)
@@ -201,6 +212,15 @@ class RobotProblemBuilder:
             self._read = with_balanced_torques(self._read, differences, self._valid(differences), instruments)
             self.motions = self._motions_of(self.model, leads=self._leads)
         return self._as_read()
+
+    def _as_moved(self) -> list[RobotMotion]:
+        """What was read of joints off the ground, with the torques of their motion for those without noise."""
+        found = []
+        for read, motion, own in zip(self._read, self.motions, self.filters, strict=True):
+            torque = own.smooth(torque_of_motion(motion, self.numbers, self.model.around(motion)))
+            rate = derivative(torque, read.rate)
+            found.append(dataclasses.replace(read, balanced_torque=torque, quiet_torque=torque, torque_rate=rate))
+        return found
 
     def _as_read(self) -> Prepared:
         """The same of the motions as they are."""
@@ -225,7 +245,7 @@ class RobotProblemBuilder:
                 return None
             for motion in self._motions_of(model, recording, unsaid):
                 around, tyres = model.around(motion), next(straight)
-                if tyres.in_place:
+                if tyres is not None and tyres.in_place:
                     around = dataclasses.replace(around, straight=tyres)
                 measured, predicted = model.sides(motion, around)
                 pieces.append(np.nan_to_num(measured - predicted))
@@ -244,7 +264,7 @@ class RobotProblemBuilder:
         if model is None:
             return None
         motions = self._motions_of(model, leads=_unsaid(self._leads, terms, lasting))
-        in_place = any(tyres.in_place for tyres in differences.straight)
+        in_place = any(tyres is not None and tyres.in_place for tyres in differences.straight)
         there = ChannelDifferences(model, motions, self.filters, differences.straight if in_place else None)
         columns = on_all_cores(lambda n: there.of_numbers(n.vary, TANGENT_STEP * n.deviation), varied)
         found = {n.label: column for n, column in zip(varied, columns, strict=True)}
@@ -256,7 +276,7 @@ class RobotProblemBuilder:
         What is not a balance of forces shows them by the slips that they cause alone.
         """
         factors = np.full(len(self.channels()), 1.0 + changes.get("contact.stiffness", 0.0))
-        factors[:3] = 1.0
+        factors[self.layout.balance] = 1.0
         return factors, [name for name in changes if name.startswith("torque_constant/")]
 
     def _model_at(
@@ -292,6 +312,8 @@ class RobotProblemBuilder:
         motions = [true_motion(model.robot, motion) for motion in self._read if recording in (None, motion.recording)]
         if leads is not None and leads.any():
             motions = [with_leads(motion, *leads) for motion in motions]
+        if self.layout.lifted:
+            return [dataclasses.replace(motion, pose=_standing_at(motion.pose)) for motion in motions]
         return with_pose(motions, model.numbers)
 
     def _wheels(self) -> tuple[FloatArray, FloatArray]:
@@ -359,6 +381,12 @@ class RobotProblemBuilder:
             differences: of these motions.
             at_peak: also those in which tyres use so much friction that their slip is open.
         """
+        if self.layout.lifted:
+            stands = [
+                (self._standing(motion) | ~known).astype(float)
+                for motion, known in zip(self.motions, differences.known, strict=True)
+            ]
+            return differences.filtered(stands) < 0.1
         pieces, seeming = [], self._seeming_numbers(differences)
         for motion, known, state in zip(self.motions, differences.known, differences.on_ground, strict=True):
             bad = slipping(seeming, motion, self.layout)
@@ -370,6 +398,13 @@ class RobotProblemBuilder:
             pieces.append((bad[:, None] | ~known).astype(float))
         return (differences.filtered(pieces) < 0.1) & ~self._silent(differences)
 
+    def _standing(self, motion: RobotMotion) -> BoolArray:
+        """Samples (T, 2n) in which a joint may be held by dry friction of unknown size: all but short moments of reversal."""
+        rows = max(round(HELD_TIME * motion.rate), 1)
+        slow = np.abs(motion.velocity).reshape(len(motion.time), -1) < HELD_SPEED
+        held: BoolArray = ndimage.binary_opening(slow, np.ones((rows, 1), dtype=bool))
+        return held
+
     def _silent(self, differences: ChannelDifferences) -> BoolArray:
         """Channels (C,) in which wheels say nothing of one another, such as those of one axle that never turn."""
         silent = np.zeros(len(self.channels()), dtype=bool)
@@ -380,7 +415,7 @@ class RobotProblemBuilder:
 
     def _at_the_limit(self, differences: ChannelDifferences) -> tuple[str, ...]:
         """That friction is used up in many samples, which are not judged, and what that may come from."""
-        if not self.layout.balanced:
+        if not self.layout.balanced or self.layout.lifted:
             return ()
         used = np.concatenate([used_friction(self.numbers, state) for state in differences.on_ground])
         part = float(np.mean(used > USED_PART))
@@ -409,14 +444,17 @@ class RobotProblemBuilder:
         """What a leftover may depend on, one array per motion."""
         found: dict[str, list[FloatArray]] = {}
         for motion, normal in zip(self.motions, differences.normal, strict=True):
-            twist, _ = twists(self.numbers, self.numbers.headings(motion.position), motion.velocity)
-            signals = {"time": motion.time, "speed": np.hypot(twist[:, 0], twist[:, 1])}
-            signals |= {name: twist[:, k] for k, name in enumerate(("v_x", "v_y", "omega"))}
-            signals |= {name: motion.pose[:, k] for k, name in enumerate(("x", "y", "yaw"))}
+            signals = {"time": motion.time}
+            if not self.layout.lifted:
+                twist, _ = twists(self.numbers, self.numbers.headings(motion.position), motion.velocity)
+                signals["speed"] = np.hypot(twist[:, 0], twist[:, 1])
+                signals |= {name: twist[:, k] for k, name in enumerate(("v_x", "v_y", "omega"))}
+                signals |= {name: motion.pose[:, k] for k, name in enumerate(("x", "y", "yaw"))}
             for i, caster in enumerate(self.robot.caster_names):
                 signals[f"steer_angle/{caster}"] = motion.position[:, i, STEER]
                 signals[f"drive_angle/{caster}"] = motion.position[:, i, DRIVE]
-                signals[f"drive_normal_force/{caster}"] = normal[:, i]
+                if not self.layout.lifted:
+                    signals[f"drive_normal_force/{caster}"] = normal[:, i]
                 for axis, axis_name in enumerate(AXIS_NAMES):
                     signals[f"{axis_name}_velocity/{caster}"] = motion.velocity[:, i, axis]
                     signals[f"{axis_name}_torque/{caster}"] = motion.balanced_torque[:, i, axis]
@@ -443,6 +481,7 @@ class RobotProblemBuilder:
         """Where an unknown torque or force may act: every joint, and forces and a moment on the chassis."""
         n = self.robot.n
         joints = tuple(f"{axis}_torque/{caster}" for caster in self.robot.caster_names for axis in AXIS_NAMES)
+        bodies = () if self.layout.lifted else WRENCH
         borders = np.cumsum([len(motion.time) for motion in self.motions])[:-1]
 
         def columns(forces: FloatArray) -> FloatArray:
@@ -456,7 +495,13 @@ class RobotProblemBuilder:
             return found
 
         variables = {name: np.concatenate(parts) for name, parts in along.items()}
-        return Sites((*joints, *WRENCH), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+        return Sites((*joints, *bodies), variables, float(SMOOTHING_SPEED.default or 0.0), columns)
+
+
+def _standing_at(pose: FloatArray) -> FloatArray:
+    """The pose (T, 3) of a robot that stands where it was tracked (T, 3), or anywhere."""
+    known = pose[np.isfinite(pose).all(axis=1)]
+    return np.tile(np.median(known, axis=0) if len(known) else np.zeros(3), (len(pose), 1))
 
 
 def _unsaid(leads: FloatArray, terms: Sequence[Term], sizes: Sequence[SizedTerm]) -> FloatArray:

@@ -54,6 +54,7 @@ from pcw_description.effects.registry import get
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER, RobotDescription
 
 from .axis_channels import kernel_arguments
+from .joint_balance import joint_sides
 from .regression_problem import BoolArray, FloatArray
 from .robot_motion import RobotMotion
 from .rolling_model import (
@@ -375,7 +376,7 @@ class ChannelModel:
             return around
         shape = motion.position.shape
         torque = np.zeros(shape) if around.torque is None else around.torque.copy()
-        normal = normal_along(motion, self.numbers) if around.normal is None else around.normal
+        normal = self.normal_along(motion) if around.normal is None else around.normal
         if isinstance(effect, JointTorqueEffect):
             axis = AXIS_NAMES.index(instance.axis or effect.axis)
             for name in instance.target:
@@ -389,6 +390,8 @@ class ChannelModel:
                 )  # fmt: skip
                 torque[:, i, axis] += found[:, 0]
             return dataclasses.replace(around, torque=torque)
+        if self.layout.lifted:  # there is nothing under the wheels
+            return around
         under, height, normal = self._under_wheels(motion, around, instance, normal)
         # What nothing is added to stays the array that it was: how the wheels move depends on nothing else of the floor.
         radius, climb = around.radius, around.climb
@@ -404,6 +407,10 @@ class ChannelModel:
                 climb = np.zeros(shape) if climb is None else climb.copy()
                 climb[:, i] -= normal[:, i, None] * self._in_wheel_frame(motion, i, gradient)
         return dataclasses.replace(around, torque=torque, radius=radius, grip=grip, height=height, climb=climb)
+
+    def normal_along(self, motion: RobotMotion) -> FloatArray:
+        """Normal forces (T, n) [N] along a motion; none off the ground."""
+        return np.zeros(motion.position.shape[:2]) if self.layout.lifted else normal_along(motion, self.numbers)
 
     def around_leaning(self, motion: RobotMotion, around: Surroundings, change: FloatArray) -> Surroundings:
         """Return the surroundings with gravity whose unit vector leans further by `change` (3,), in axes of the yaw."""
@@ -462,6 +469,8 @@ class ChannelModel:
     def sides(self, motion: RobotMotion, around: Surroundings, numbers: ModelNumbers | None = None) -> Sides:
         """Measured and predicted side of every channel along a true motion, (T, C) each."""
         numbers = numbers or self.numbers
+        if self.layout.lifted:  # what pushes a chassis on its jack, or what it feels there, says nothing of the robot
+            return joint_sides(motion, numbers, around)
         sides = channel_sides(motion, numbers, self.layout, around)
         for instance in self.robot.physics:
             if not isinstance(effect := get(instance.name), ClockEffect):  # a true motion has the right times
@@ -484,6 +493,8 @@ class ChannelModel:
             place = instance.target, instance.parameters, instance.axis
             return self.sides(with_true_angles(self.robot, motion, effect, *place), around)
         if isinstance(effect, (JointTorqueEffect, ContactEffect)):
+            return self.sides(motion, self.around_with(motion, around, instance))
+        if self.layout.lifted:
             return self.sides(motion, self.around_with(motion, around, instance))
         if isinstance(effect, GravityEffect):  # the lean itself besides, which `sides` adds for the robot's own effects only
             sides = self.sides(motion, self.around_with(motion, around, instance))
@@ -533,7 +544,7 @@ class ChannelModel:
         What it changes of the forces under the wheels is that of the surroundings' `pull`.
         """
         along, across = self._pull(motion, change).T
-        if self.layout.balanced:
+        if self.layout.balanced and not self.layout.lifted:
             mass, centre = _mass_and_centre(numbers)
             measured[:, 0] += mass * along
             measured[:, 1] += mass * across

@@ -252,19 +252,22 @@ def _in_body(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
     return np.stack([along, across, velocity[:, 2]], axis=1)
 
 
-def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording]) -> float:
+def choose_cutoff(robot: RobotDescription, recordings: Sequence[Recording], lifted: bool = False) -> float:
     """Return the largest cut-off at which differentiated encoder noise stays small against the motion [Hz].
 
     White noise s of a joint angle at the rate f_s, differentiated twice and cut at f_c, has the variance
     2 s^2 (2 pi)^4 f_c^5 / (5 f_s); it may reach a part of the largest accelerations recorded.
 
     Nor does it reach beyond what torques tell in any of the recordings. A controller answers the noise of its encoders with
-    torques, so that noise is on both sides of a balance, and where there is nothing else masses come out of it.
+    torques, so that noise is on both sides of a balance, and where there is nothing else masses come out of it. Of wheels
+    that are `lifted` off the ground no tyre gives way.
     """
     contact = robot.contact
     # Slip stiffness 2 mu_p F_z / lambda_p over the relaxation length: the spring between wheel and ground, per unit mass.
     stiffness = 2.0 * contact.mu_p * GRAVITY / (contact.lambda_p * contact.relaxation_length)
-    cutoffs = [LARGEST_CUTOFF, TYRE_MARGIN * float(np.sqrt(stiffness)) / (2.0 * np.pi)]
+    cutoffs = [LARGEST_CUTOFF]
+    if not lifted:
+        cutoffs.append(TYRE_MARGIN * float(np.sqrt(stiffness)) / (2.0 * np.pi))
     for recording in recordings:
         joints = recording.joint_states
         rate = 1.0 / float(np.median(np.diff(joints.stamp)))
@@ -309,10 +312,14 @@ def _torque_band(torque: FloatArray | None, rate: float) -> float:
     return max(found, default=math.inf)
 
 
+def has_torques(recordings: Sequence[Recording]) -> bool:
+    """Whether torques were recorded, in all of them."""
+    return all(bool(np.isfinite(recording.joint_states.effort).any()) for recording in recordings)
+
+
 def has_balance(robot: RobotDescription, recordings: Sequence[Recording]) -> bool:
     """Whether forces can be balanced: torques were recorded, all casters have an offset, and no fixed wheel carries a part."""
-    with_torque = all(np.isfinite(recording.joint_states.effort).any() for recording in recordings)
-    return with_torque and not robot.fixed_wheels and bool(np.all(np.abs(robot.caster_offset[:, 0]) > 1e-3))
+    return has_torques(recordings) and not robot.fixed_wheels and bool(np.all(np.abs(robot.caster_offset[:, 0]) > 1e-3))
 
 
 def _runs(flags: BoolArray) -> list[tuple[int, int]]:

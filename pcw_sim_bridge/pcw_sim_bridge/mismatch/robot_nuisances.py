@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from .rolling_model import ModelNumbers
 Vary = Callable[[ModelNumbers, float], None]
 # (tolerance, label, nominal value, variation)
 Deviation = tuple[str, str, float, Vary]
-Index = int | tuple[int, ...]
+Index = int | tuple[int | slice, ...]
 
 # A mass, a length, a gain is not sought beyond this factor of what the description says.
 FARTHEST = 4.0
@@ -71,6 +71,7 @@ def robot_nuisances(
             loose=n.label.startswith(LOOSE),
         )
         for n, column in zip(varied, columns, strict=True)
+        if column.any() or not differences.model.layout.lifted  # off the ground most numbers do nothing
     ]
     return found + [number for number in floor_nuisances(robot, differences) if number.name.startswith(kinds)]
 
@@ -79,8 +80,9 @@ def _misjudged(number: VariedNumber, column: FloatArray, differences: ChannelDif
     """Change of a small inertia that does to the forces what the model misjudges of them: it is known no better by them."""
     if not number.label.startswith(INERTIAS) or not len(column):
         return 0.0
-    size = float(np.sqrt(np.mean(column[:, :3] ** 2)))
-    forces = float(np.sqrt(np.mean(differences.measured[:, :3] ** 2)))
+    balance = differences.model.layout.balance
+    size = float(np.sqrt(np.mean(column[:, balance] ** 2)))
+    forces = float(np.sqrt(np.mean(differences.measured[:, balance] ** 2)))
     return min(MODEL_DEVIATION * forces / max(size, 1e-300), number.nominal)
 
 
@@ -198,7 +200,7 @@ def _suspension(differences: ChannelDifferences) -> list[VariedNumber]:
     number of its own: it may stand elsewhere on a frame that gives way, or its driver may have taken gravity out.
     """
     layout, numbers = differences.model.layout, differences.model.numbers
-    if not (layout.balanced or layout.imu):
+    if layout.lifted or not (layout.balanced or layout.imu):
         return []
     found = []
     for k, axis in enumerate("xy"):
@@ -217,18 +219,24 @@ def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
 
     Its torque leaps with every commanded speed, 2 w J (speed it is behind), and fades as the joint follows, while its integral
     grows, w^2 J times the same. Read once a cycle h, always at the same place of it, it differs from its mean by up to w h of
-    what accelerates the joint, and the other way by w^2 h / 2 for each second that it is behind.
+    what accelerates the joint, and the other way by w^2 h / 2 for each second that it is behind. Drives of a kind are taken
+    for alike on the ground; off it what one of them reports otherwise would pass for a weaker motor.
     """
     motions = [motion for motion in differences.motions if np.any(motion.loops)]
     if not motions:
         return
     part = min(LOOP_BANDWIDTH * max(motion.sampling for motion in motions), LARGEST_UNREPORTED)
+    behind = any(np.any(motion.loops[..., 1]) for motion in motions)
+    layout = differences.model.layout
+    owners: Mapping[str, int | slice] = {"": slice(None)}
+    if layout.lifted:
+        owners = {f"/{name}": i for i, name in enumerate(layout.casters)}
     for axis, name in enumerate(AXIS_NAMES):
-        yield VariedNumber(f"torque_report.{name}", "1", 0.0, part, _entry("unreported", (axis, 0)))
-        if any(np.any(motion.loops[..., 1]) for motion in motions):
-            yield VariedNumber(
-                f"torque_report.{name}_behind", "1/s", 0.0, 0.5 * LOOP_BANDWIDTH * part, _entry("unreported", (axis, 1))
-            )
+        for of, own in owners.items():
+            yield VariedNumber(f"torque_report.{name}{of}", "1", 0.0, part, _entry("unreported", (own, axis, 0)))
+            if behind:
+                label, deviation = f"torque_report.{name}_behind{of}", 0.5 * LOOP_BANDWIDTH * part
+                yield VariedNumber(label, "1/s", 0.0, deviation, _entry("unreported", (own, axis, 1)))
 
 
 def _geometry(robot: RobotDescription) -> Iterator[Deviation]:

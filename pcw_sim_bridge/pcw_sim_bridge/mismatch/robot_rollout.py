@@ -79,7 +79,7 @@ class Undescribed:
     """Re-tuned numbers that no description holds; see `ModelNumbers`.
 
     Attributes:
-        unreported: of the torques of drives and steerings (2, 2).
+        unreported: of the torques of all drives and of all steerings (2, 2).
         torque_lag: [s].
         lean, detuning: of the chassis on its springs (2,) [s^2].
     """
@@ -99,7 +99,8 @@ class Undescribed:
     def among(self, numbers: ModelNumbers) -> ModelNumbers:
         """All numbers of a model, these and those of its description."""
         return dataclasses.replace(
-            numbers, unreported=self.unreported, torque_lag=self.torque_lag, lean=self.lean, detuning=self.detuning
+            numbers, unreported=np.broadcast_to(self.unreported, numbers.unreported.shape), torque_lag=self.torque_lag,
+            lean=self.lean, detuning=self.detuning,
         )
 
     def torque(self, motion: RobotMotion, numbers: ModelNumbers) -> FloatArray:

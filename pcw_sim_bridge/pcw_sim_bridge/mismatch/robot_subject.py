@@ -27,6 +27,7 @@ from pcw_description.robot_description import (
 )
 from pcw_description.robot_file import load_robot, robot_to_mapping
 
+from ..plants.true_robot import as_it_really_is
 from .command_tracking import command_problems, joints_that_report_commands
 from .errors import MismatchError
 from .even_stamps import EvenStamps
@@ -34,6 +35,7 @@ from .findings import InputFinding
 from .found_effect import effect_instance
 from .joint_glitches import without_glitches
 from .long_recordings import part_of
+from .off_ground import wheels_off_ground, wheels_turn_alone
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .reported_torques import doubtful_reports, told_of
 from .robot_channels import RobotProblemBuilder
@@ -48,6 +50,7 @@ from .subject import Opened
 from .torque_units import torque_units
 from .wheel_agreement import contradictions
 
+OFF_GROUND = "joint_states: the wheels turn and the robot stands: they are off the ground, and each joint is judged by itself"
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 
 
@@ -61,6 +64,7 @@ class RobotSubject:
         self._undescribed = Undescribed()
         self._missing: tuple[str, ...] = ()
         self._sensors: tuple[Path, tuple[bool, bool]] | None = None
+        self._lifted: tuple[Path, bool] | None = None
 
     @classmethod
     def load(cls, path: Path) -> RobotSubject:
@@ -81,8 +85,11 @@ class RobotSubject:
         self._check_sensors(path, recording)
         recording, jumps = without_glitches(EvenStamps().evenly_stamped(recording))
         warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *jumps]
-        against = contradictions(self._seen_robot(), recording)
-        warnings += against or unlike_axes(self._seen_robot(), recording)
+        if self._is_lifted(path, recording):
+            warnings.append(OFF_GROUND)
+        else:
+            against = contradictions(self._seen_robot(), recording)
+            warnings += against or unlike_axes(self._seen_robot(), recording)
         warnings += told_of(self._seen_robot(), doubtful_reports(self._seen_robot(), recording))
         started = recording.t0_ns * 1e-9
         finding = InputFinding(str(path), recording.sha256, recording.duration, role, tuple(warnings), started)
@@ -119,6 +126,23 @@ class RobotSubject:
                     f"{lacks} has no {name}, and {has} has; allowed: recordings with the same sensors in one analysis"
                 )
 
+    def _is_lifted(self, path: Path, recording: Recording) -> bool:
+        """Whether the wheels are off the ground: in all recordings of one analysis, or in none."""
+        lifted = wheels_off_ground(self._seen_robot(), recording)
+        if self._lifted is None:
+            self._lifted = path, lifted
+        first, expected = self._lifted
+        if lifted != expected:
+            off, on = (path, first) if lifted else (first, path)
+            raise MismatchError(
+                f"in {off} the wheels are off the ground, and in {on} they move the robot; allowed: one kind in one analysis"
+            )
+        return lifted
+
+    @property
+    def _off_ground(self) -> bool:
+        return self._lifted is not None and self._lifted[1]
+
     def part_of(self, opened: Sequence[Opened], use: str) -> tuple[Sequence[Opened], str]:
         """Return recordings of some minutes together; see `long_recordings`."""
         parts, told = part_of([o.recording for o in opened], use)
@@ -133,7 +157,13 @@ class RobotSubject:
         return self._builder(opened).build()
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
-        """Return recordings with torques at the joints; where they are in unknown units, as they are, with a warning."""
+        """Return recordings with torques at the joints; where they are in unknown units, as they are, with a warning.
+
+        So they are, too, where torques alone tell that the wheels are off the ground, for a problem of another kind.
+        """
+        if not self._off_ground and wheels_turn_alone(problem):
+            self._lifted, self._cutoff = (Path(opened[0].finding.path), True), None
+            return [Opened(one.recording, dataclasses.replace(one.finding, warnings=(OFF_GROUND,))) for one in opened]
         found = torque_units(self._seen_robot(), problem)
         if found is None:
             return opened
@@ -155,9 +185,9 @@ class RobotSubject:
     def _builder(self, opened: Sequence[Opened]) -> RobotProblemBuilder:
         recordings, robot = [o.recording for o in opened], self._seen_robot()
         if self._cutoff is None:
-            self._cutoff = choose_cutoff(robot, recordings)
+            self._cutoff = choose_cutoff(robot, recordings, self._off_ground)
         try:
-            return RobotProblemBuilder(robot, recordings, self._cutoff)
+            return RobotProblemBuilder(robot, recordings, self._cutoff, lifted=self._off_ground)
         except MismatchError as error:
             told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
             raise MismatchError("; ".join((str(error), *told))) from None
@@ -175,10 +205,15 @@ class RobotSubject:
         return get(instance.name).statement(instance.target, instance.parameters, instance.axis)
 
     def patched(self, effects: Sequence[EffectInstance], retuned: Mapping[str, float]) -> RobotSubject:
-        """Return the robot with effects added and its numbers re-tuned; see `retuned_robot`."""
+        """Return the robot with effects added and its numbers re-tuned; see `retuned_robot`.
+
+        Raises:
+            PcwError: there is no such robot.
+        """
         robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
         subject = RobotSubject(retuned_robot(robot, retuned))
-        subject._cutoff = self._cutoff
+        as_it_really_is(subject.robot)
+        subject._cutoff, subject._lifted = self._cutoff, self._lifted
         subject._undescribed = Undescribed.of(retuned)
         return subject
 
@@ -197,6 +232,8 @@ class RobotSubject:
     def absent(self, opened: Sequence[Opened]) -> tuple[tuple[str, str], ...]:
         """Return what was not recorded, and what that costs, in words."""
         recordings = [o.recording for o in opened]
+        if self._off_ground:
+            return (("the ground", "each joint is judged by itself; chassis, wheels, tyres, floor and IMU are not seen"),)
         cannot = "forces, friction and masses cannot be judged, nor simulated"
         casters = tuple((f"caster {name}", f"{cannot}, and its wheel is not seen") for name in self._missing)
         known = any(isinstance(get(instance.name), ActuatorEffect) for instance in self.robot.physics)
@@ -219,8 +256,10 @@ class RobotSubject:
         return responses_in_words(speed_responses(self._seen_robot(), [o.recording for o in opened]))
 
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
-        """Return the windows to simulate; None without torques, or for a robot that cannot be driven by them."""
+        """Return the windows to simulate; None without torques or ground, or for a robot that cannot be driven by them."""
         recordings = [o.recording for o in opened]
+        if self._off_ground:
+            return None
         without_offset = bool(np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3))
         if without_offset or self.robot.fixed_wheels or not all(map(_has_effort, recordings)):
             return None

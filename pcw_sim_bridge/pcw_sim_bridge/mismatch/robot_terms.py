@@ -23,6 +23,7 @@ from pcw_description.effects.kinds import (
     ContactEffect,
     DescriptionEffect,
     EncoderEffect,
+    GravityEffect,
     ImuEffect,
     JointTorqueEffect,
     TransmissionEffect,
@@ -120,10 +121,13 @@ class _TermMaker:
             return self._joint_columns(effect, target, axis, shape)
 
         first = columns(shapes[0])
-        size = np.sqrt(np.mean(self.differences.measured[:, :3] ** 2))
+        if not first.any():
+            return None
+        balance = self.layout.balance
+        size = np.sqrt(np.mean(self.differences.measured[:, balance] ** 2))
         parameters = []
         for k, parameter in enumerate(effect.linear_parameters):
-            scale = float(np.sqrt(np.mean(first[:, :3, k] ** 2)))
+            scale = float(np.sqrt(np.mean(first[:, balance, k] ** 2)))
             deviation = float(size) / max(scale, 1e-12)
             parameters.append(
                 LinearParameter(
@@ -244,6 +248,9 @@ class _TermMaker:
         searched = self._searched(effect)
         if not searched or (isinstance(effect, ContactEffect) and not (self.layout.balanced or self._rolls_unevenly(effect))):
             return None
+        stands = target == ("chassis",) and not isinstance(effect, GravityEffect)
+        if self.layout.lifted and (isinstance(effect, ContactEffect) or stands):
+            return None  # no wheel touches the ground, and the chassis shows nothing but how it leans
         if not (self.layout.balanced or self.layout.imu) and target == ("chassis",):
             return None  # loads and slopes would show as what tyres slip under forces that nobody measured
         if isinstance(effect, TransmissionEffect) and not self._has_rotors(target, axis or effect.axis):

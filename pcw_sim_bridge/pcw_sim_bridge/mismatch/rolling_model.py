@@ -49,7 +49,7 @@ from pcw_description.differential_kinematics import (
     registration_kernel,
     wheel_jacobian_kernel,
 )
-from pcw_description.robot_description import DRIVE, GRAVITY, STEER, RobotDescription
+from pcw_description.robot_description import AXIS_NAMES, DRIVE, GRAVITY, STEER, RobotDescription
 from pcw_description.support_forces import plane_gradient, support_forces
 
 from .chassis_sway import ChassisSway
@@ -75,6 +75,7 @@ class ChannelLayout:
         balanced: motor torques and an offset along the heading: there is a balance of forces.
         imu: an inertial sensor; pose: a tracked pose.
         axles: fixed axles, none or one.
+        lifted: the wheels are off the ground, and each joint has a balance of its own; see `joint_balance`.
     """
 
     casters: tuple[str, ...]
@@ -82,16 +83,24 @@ class ChannelLayout:
     imu: bool
     pose: bool
     axles: int = 0
+    lifted: bool = False
 
     @property
     def redundant(self) -> int:
-        """How many velocities of the wheels there are beyond the three that make the motion."""
-        return 2 * len(self.casters) + self.axles - 3
+        """How many velocities of the wheels there are beyond the three that make the motion; none where they make none."""
+        return 0 if self.lifted else 2 * len(self.casters) + self.axles - 3
+
+    @property
+    def balance(self) -> slice:
+        """Columns of the balance of forces; empty where there is none."""
+        if not self.balanced:
+            return slice(0, 0)
+        return slice(0, 2 * len(self.casters) if self.lifted else len(WRENCH))
 
     @property
     def consistency(self) -> slice:
         """Columns of `rolling_consistency`, longitudinal and lateral by caster."""
-        start = 3 if self.balanced else 0
+        start = self.balance.stop
         return slice(start, start + (2 * len(self.casters) if self.redundant else 0))
 
     @property
@@ -108,6 +117,10 @@ class ChannelLayout:
 
     def channels(self) -> tuple[Channel, ...]:
         """The channels in order."""
+        if self.lifted:
+            return tuple(
+                Channel(f"{axis}_torque/{name}", "N m", (name,), axis) for name in self.casters for axis in AXIS_NAMES
+            )
         found = [Channel(name, "N m" if "torque" in name else "N") for name in WRENCH] if self.balanced else []
         # 2n slips of which a twist makes three: each sample tells so much less than its numbers.
         share = self.redundant / (2.0 * len(self.casters))
@@ -223,8 +236,8 @@ class ModelNumbers:
         tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
         damping_time: of their rubber [s]: a tyre's force is ahead of its relaxed slip by this.
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
-        unreported: how much of each kind of `loops` the joints were given more than drives that hold speeds report, drives and
-            steerings (2, 2) [1], [1/s].
+        unreported: how much of each kind of `loops` the joints were given more than drives that hold speeds report
+            (n, 2, 2) [1], [1/s].
         heading_lead: how much later the headings were that belong to the rates beside them [s]. A simulation in steps that
             makes its rates from one set of angles, and the next angles from those rates, is half a step off.
         clock: how much later than the joints' the stamps of IMU and tracker are (2,) [s].
@@ -323,7 +336,7 @@ class ModelNumbers:
             damping_time=DAMPING_TIME,
             softness=np.ones((robot.n + len(robot.fixed_axle), 2)),
             torque_lag=0.0,
-            unreported=np.zeros((2, 2)),
+            unreported=np.zeros((robot.n, 2, 2)),
             heading_lead=0.0,
             clock=np.zeros(2),
             spring=robot.wheel_suspension.stiffness,
@@ -838,12 +851,7 @@ def rolling_state(
     patches[:, LAMBDA] *= numbers.softness[:n, 0]  # the edge of a patch slips as the tyre does
     spin = _scrub(patches, velocity[:, :, STEER] + twist[:, 2:], wheels.speed, grip)
     if layout.balanced:
-        # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads
-        # of tyres, would be found as small, or as large, as makes that noise least.
-        added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
-        added += (numbers.gain - 1.0) * motion.balanced_torque + numbers.torque_lag * motion.torque_rate
-        if numbers.unreported.any():
-            added += np.sum(numbers.unreported * motion.loops, axis=3)
+        added = added_torque(motion, numbers, around)
         if around.climb is not None:  # it pushes the module like a torque that the wheel's own balance does not hold
             added[:, :, DRIVE] += wheels.radius * around.climb[:, :, 0]
         load, force = (
@@ -861,6 +869,17 @@ def rolling_state(
             wrench = wrench - _wrench_of(numbers.steer_axis, offset, direction, around.climb, np.zeros_like(spin))
         force = load = _shared_forces(numbers.steer_axis, numbers.caster_offset, numbers.axle, wheels.steer_angle, wrench)
     return RollingState(wheels, grip, spin, force, load)
+
+
+def added_torque(motion: RobotMotion, numbers: ModelNumbers, around: Surroundings) -> FloatArray:
+    """What joints are given besides the torques that were reported (T, n, 2) [N m]."""
+    # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads of
+    # tyres, would be found as small, or as large, as makes that noise least.
+    added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
+    added += (numbers.gain - 1.0) * motion.balanced_torque + numbers.torque_lag * motion.torque_rate
+    if numbers.unreported.any():
+        added += np.sum(numbers.unreported * motion.loops, axis=3)
+    return added
 
 
 def _without(twist_dot: FloatArray, pull: FloatArray) -> FloatArray:

@@ -100,7 +100,7 @@ def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | 
     of_all = [term for term in problem.terms if term.target == robot.caster_names and term.effect == TORQUE_CONSTANT]
     both = [term for axis in AXIS_NAMES for term in of_all if term.axis == axis]
     rubbing = [term for term in problem.terms if len(term.target) == 1 and term.effect in FRICTIONS]
-    force = [c for c, channel in enumerate(problem.channels) if channel.name.startswith("chassis_")]
+    force = [c for c, channel in enumerate(problem.channels) if channel.unit in ("N", "N m")]
     if len(both) != len(AXIS_NAMES) or not force:
         return None
     # Joints that rub, one or all, need many times the torque that moves the robot, and are no joints in other units.

@@ -287,7 +287,7 @@ def _all_places(sites: Sites) -> Iterator[tuple[tuple[Place, ...], tuple[str, ..
             for quantity in _own_quantities(axis):
                 names = [f"{quantity}/{caster}" for caster in casters]
                 own = tuple(place(caster, name) for caster, name in zip(casters, names, strict=True))
-                if own[0].factor.variable == names[0]:
+                if own[0].factor.variable == names[0] or names[0] not in variables:
                     continue
                 for places in (*((one,) for one in own), own):
                     yield places, _kinds(names[0])
@@ -303,7 +303,8 @@ def _all_places(sites: Sites) -> Iterator[tuple[tuple[Place, ...], tuple[str, ..
                     dataclasses.replace(place(caster, "x"), arguments=((("x", 1.0),), (("y", 1.0),))) for caster in casters
                 ), ("map",)
     yield from _couplings(casters)
-    yield from _forces(shared, variables)
+    if "speed" in variables:  # off the ground none says where the robot goes
+        yield from _forces(shared, variables)
 
 
 def _own_quantities(axis: str) -> tuple[str, ...]:
