@@ -642,7 +642,7 @@ def test_a_small_law_that_other_data_contradict_is_no_finding(
 
     prover = SimpleNamespace(
         _held_out=lambda explanation: against, _rollout=lambda explanation, held_out: None,
-        _useless=lambda explanation, held_out: says(prover, "errors"),
+        _impossible=lambda explanation, held_out: None, _useless=lambda explanation, held_out: says(prover, "errors"),
         _misleading=lambda explanation, held_out, after: says(prover, "simulation"),
         _no_better=lambda explanation, held_out: None, _is_patched=lambda explanation: False,
         _not_helping=lambda explanation, held_out, after: frozenset(),

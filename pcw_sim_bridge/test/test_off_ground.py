@@ -147,7 +147,7 @@ def test_without_torques_there_is_nothing_to_judge(tmp_path: Path, monkeypatch: 
 
 
 def test_no_patch_makes_a_robot_that_cannot_be() -> None:
-    smaller = EffectInstance("wheel_radius_error", ("front_left",), {"error": -0.034}, None)
+    smaller = EffectInstance("wheel_radius_error", ("front_left",), {"error": -0.05}, None)
     with pytest.raises(PcwError, match="cannot be"):
         RobotSubject(load_robot("tidybot2")).patched([smaller], {})
 

@@ -527,7 +527,7 @@ def _still_needed(
 
 
 def _size_evidence(problem: RegressionProblem, fit: Fit, instance: Instance, size: FloatArray) -> float:
-    """Log odds that an instance is there, of about a given size (P,), against that it is not; none where next to nothing is."""
+    """Log odds that an instance is there, of about a given size (P,), against that it is not; none for next to nothing."""
     index = fit.instances.index(instance)
     start = len(problem.nuisances) + sum(len(other.active) for other in fit.instances[:index])
     rows = slice(start, start + len(instance.active))
