@@ -47,6 +47,8 @@ from .regression_problem import HEALTHY, STRAINED, TAKEN_OVER, FloatArray, Regre
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep
 from .subject import Subject
+from .turned_findings import instance_of, turned_findings
+from .turned_steering import FIGHTING
 from .unknown_law import Law
 from .whitened_regression import Fit, predicted
 
@@ -125,6 +127,10 @@ def analyse(
     inputs = tuple(o.finding for o in (*opened, *held_out))
     judged = problem.valid.any(axis=1)
     usable = float(judged.sum()) / problem.rate
+    turned = subject.turned_steering(problem, opened)
+    if turned is not None and (turned.fighting > FIGHTING or usable < LEAST_DURATION):
+        found = turned_findings(subject, turned, problem, inputs, (*lengths, *problem.remarks), time.monotonic() - begun)
+        return Analysis(found, subject.patched([instance_of(turned)], {}))
     if usable < LEAST_DURATION or (problem.shaken and judged.mean() < LEAST_UNDISTURBED):
         note = (
             f"only {usable:.1f} s of usable motion (moving, no gross slip), {100 * judged.mean():.0f} % of what was recorded; "

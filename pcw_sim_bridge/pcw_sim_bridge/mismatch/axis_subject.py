@@ -70,6 +70,9 @@ class AxisSubject:
         """Return the recordings as they are: their description says in which units."""
         return opened
 
+    def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> None:
+        """Return None: an axis has none."""
+
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what returns the problem: all candidates of one channel are made in no time."""
         problem = self.problem(opened)

@@ -314,7 +314,7 @@ class RegressionProblem:
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
         remarks: what a reader has to know of the recordings.
-        shaken: whether one of these is that wheels shake.
+        shaken: whether one of these is that wheels shake; limited: whether one is that torques use up their friction.
         near: how columns of a term follow from its derivatives, by term; see `around`.
     """
 
@@ -343,6 +343,7 @@ class RegressionProblem:
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     shaken: bool = False
+    limited: bool = False
     near: Mapping[int, _NearSecant] = dataclasses.field(default_factory=dict)
     _remembered: dict[tuple[int, tuple[tuple[str, float], ...]], FloatArray] = dataclasses.field(
         default_factory=dict, init=False, repr=False, compare=False

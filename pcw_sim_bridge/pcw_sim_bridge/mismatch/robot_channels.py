@@ -55,6 +55,7 @@ from .seeming_geometry import seeming_numbers
 from .signal_filter import SignalFilter, derivative
 from .sudden_slip import spinning, sudden_slip
 from .torque_errors import INSTRUMENTS, with_balanced_torques
+from .turned_steering import TurnedSteering, turned_steering
 from .unresolved_motion import unresolved_rate
 
 # Slip that the model may hold: a floor, and that part of the speed up to which a tyre grips more the more it slips.
@@ -154,7 +155,7 @@ class RobotProblemBuilder:
         rate = float(np.mean([f.decimated_rate for f in self.filters]))
         terms: tuple[Term, ...] = ()
         places, headings = self._wheels()
-        shaken = self._shaken()
+        shaken, limited = self._shaken(), self._at_the_limit(differences)
         if with_terms:
             angle = differences.filtered([motion.position for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
@@ -185,9 +186,20 @@ class RobotProblemBuilder:
             exact=exact,
             derive=functools.partial(self._derive, differences, terms),
             softened=self._softened if self.layout.balanced else None,
-            remarks=(*shaken, *self._at_the_limit(differences)),
+            remarks=(*shaken, *limited),
             shaken=bool(shaken),
+            limited=bool(limited),
         )
+
+    def turned_steering(self, limited: bool) -> TurnedSteering | None:
+        """Return the steering whose zero is far off, where wheels work against each other by it alone; see there."""
+        if not self.layout.balanced or self.layout.lifted:
+            return None
+
+        def slides(numbers: ModelNumbers) -> float:
+            return float(np.mean(np.concatenate([slipping(numbers, motion, self.layout) for motion in self.motions])))
+
+        return turned_steering(self.model, self.motions, self.filters, limited, slides)
 
     @functools.cached_property
     def _prepared(self) -> Prepared:

@@ -48,6 +48,7 @@ from .sensor_axes import unlike_axes
 from .speed_response import responses_in_words, speed_responses
 from .subject import Opened
 from .torque_units import torque_units
+from .turned_steering import TurnedSteering
 from .wheel_agreement import contradictions
 
 OFF_GROUND = "joint_states: the wheels turn and the robot stands: they are off the ground, and each joint is judged by itself"
@@ -176,6 +177,10 @@ class RobotSubject:
             warnings = (*one.finding.warnings, found.warning)
             right.append(Opened(recording, dataclasses.replace(one.finding, warnings=warnings)))
         return right
+
+    def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> TurnedSteering | None:
+        """Return the one steering whose zero makes wheels work against each other, where they do."""
+        return self._builder(opened).turned_steering(problem.limited)
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes it of the candidates of some keys alone."""

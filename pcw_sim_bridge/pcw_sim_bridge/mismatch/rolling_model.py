@@ -666,6 +666,13 @@ def _axle_speeds(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
     return speeds
 
 
+def wrench_of(numbers: ModelNumbers, state: RollingState) -> FloatArray:
+    """Wrench on the base (T, 3) of the forces under rolling wheels."""
+    wheels = state.wheels
+    wrench: FloatArray = _wrench_of(numbers.steer_axis, wheels.offset, wheels.direction, state.load, state.spin)
+    return wrench
+
+
 def inertial_wrench(
     numbers: ModelNumbers, motion: RobotMotion, direction: FloatArray, twist: FloatArray, twist_dot: FloatArray
 ) -> FloatArray:
@@ -917,7 +924,7 @@ def channel_sides(
     leaning = _leaning(numbers, motion.rate, twist, twist_dot)
     measured, predicted = [], []
     if layout.balanced:
-        base = _wrench_of(numbers.steer_axis, wheels.offset, wheels.direction, state.load, state.spin)
+        base = wrench_of(numbers, state)
         measured.append(base if motion.error is None else base + motion.error.wrench)
         wrench = inertial_wrench(numbers, motion, wheels.direction, twist, twist_dot)
         if leaning is not None:

@@ -15,6 +15,7 @@ from pcw_description.effect_instance import EffectInstance
 from .findings import InputFinding
 from .regression_problem import FloatArray, RegressionProblem
 from .rollout import Windows
+from .turned_steering import TurnedSteering
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +49,9 @@ class Subject(Protocol):
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
         """Return recordings in the units that a description asks for, told by their problem; the same if they are."""
+
+    def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> TurnedSteering | None:
+        """Return the one cause beside which nothing can be judged, see `turned_steering`; None where there is no such thing."""
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes the same of the candidates of some keys alone, none of which is made before."""
