@@ -51,7 +51,7 @@ class Subject(Protocol):
         """Return recordings in the units that a description asks for, told by their problem; the same if they are."""
 
     def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> TurnedSteering | None:
-        """Return the one cause beside which nothing can be judged, see `turned_steering`; None where there is no such thing."""
+        """Return the one cause beside which nothing can be judged, see `turned_steering`; None where there is none."""
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes the same of the candidates of some keys alone, none of which is made before."""
