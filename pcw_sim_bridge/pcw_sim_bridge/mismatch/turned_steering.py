@@ -40,7 +40,7 @@ TURNS = np.radians(np.arange(-170.0, 181.0, 10.0))  # of a zero that are tried f
 LEAST_TURN = 0.05  # [rad]; less does not use up the friction of wheels
 # What forces leave has to be this part of all of them, and of that the turn may leave so much; that of any other steering
 # leaves clearly more.
-LEAST_PART, LEFT_PART, CLEARLY = 0.1, 0.35, 1.5
+LEAST_PART, LEFT_PART, CLEARLY = 0.05, 0.35, 1.5
 LEAST_PART_LIMITED = 0.03  # where friction is used up, and nothing could be said otherwise
 FIGHTING = 0.1  # of the samples, in which wheels are driven against each other
 FRICTION_SPEED = 0.05  # [rad/s], at which dry friction reverses
@@ -111,7 +111,9 @@ def turned_steering(
         [np.array_split(forces.wrench(best, t)[1], STRETCHES)[k] for k, t in enumerate(told.tolist())]
     )  # fmt: skip
     chance = math.sqrt((STRETCHES - 1) / STRETCHES * float(np.sum((told - np.mean(told)) ** 2)))  # of a jackknife
-    half = float(stats.t.ppf(0.975, STRETCHES - 1)) * math.hypot(chance, MODEL_DEVIATION * turn)
+    # What is left is no noise, and may as well be a part of that wheel's force that points another way.
+    by_chance = float(stats.t.ppf(0.975, STRETCHES - 1)) * math.hypot(chance, MODEL_DEVIATION * turn)
+    half = math.hypot(by_chance, after / forces.of_wheel[best])
     odds = np.exp(-forces.seconds / STRETCH * np.log(least / least[best]))
     offset = -math.remainder(turn, math.tau)
     return TurnedSteering(
@@ -125,7 +127,8 @@ class _Forces:
     """What the forces of all wheels do to a robot, and what its motion takes.
 
     Attributes:
-        layout: of the channels of forces; typical: size of all forces together where they are large [N].
+        layout: of the channels of forces; typical: size of all forces together where they are large; of_wheel: of each wheel's
+            there (n,) [N].
         telling: samples (T,) in which they are: where next to none acts none is left.
         seconds: of all motions.
     """
@@ -141,10 +144,12 @@ class _Forces:
         pieces = []
         for motion, near, own in zip(motions, self._around, filters, strict=True):
             load = rolling_state(motion, model.numbers, self.layout, near).load
-            pieces.append(own.apply(np.linalg.norm(load, axis=2).sum(axis=1)))
-        size = np.concatenate(pieces)
+            pieces.append(own.apply(np.linalg.norm(load, axis=2)))
+        sizes = np.concatenate(pieces)
+        size = sizes.sum(axis=1)
         self.telling: BoolArray = size >= np.median(size)
         self.typical = float(np.median(size[self.telling]))
+        self.of_wheel = np.maximum(np.median(sizes[self.telling], axis=0), 1e-300)
         self.seconds = sum(float(motion.time[-1] - motion.time[0]) for motion in motions)
 
     def wrench(
