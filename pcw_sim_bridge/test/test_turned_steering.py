@@ -40,7 +40,7 @@ def test_a_zero_far_off(
     assert (found.verdict, named.name, named.target) == ("explained", "steer_zero_offset", (caster,))
     told = named.parameters["offset"]
     assert abs(math.remainder(told.value - offset, math.tau)) < 0.02 + 0.02 * abs(offset)
-    assert told.low < told.value < told.high < told.value + 0.3
+    assert told.low < told.value < told.high < told.value + 0.5
     assert named.probability > 0.9
     assert found.fit is not None and found.fit.gap_closed > 0.6
     assert f"steering of {caster} turned by" in found.notes[0] and "degrees" in found.notes[0]
