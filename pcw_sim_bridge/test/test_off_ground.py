@@ -84,6 +84,8 @@ def test_what_joints_do(tmp_path: Path, robot: str, plant: str, effect: dict[str
         if isinstance(value, float):
             assert named.parameters[name].value == pytest.approx(value, rel=tolerance, abs=0.005)
     assert found.fit is not None and found.fit.gap_closed > 0.9
+    assert set(found.fit.rollout) == {"drive_velocity", "steer_velocity"}
+    assert found.fit.rollout_gap_closed is not None and found.fit.rollout_gap_closed > 0.8
 
 
 def test_a_difference_between_directions_is_no_load_besides(tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ class RobotPart:
         starts: first row of each window after its lead (W,); marks: rows of the horizons in a window.
         tracked: whether the path is measured.
         noise: deviations of the white noise of joint angles and torques as recorded (n, 2) each, and of the path (3,).
+        lifted: the wheels are off the ground: joints move, and nothing else.
     """
 
     numbers: ModelNumbers
@@ -63,6 +64,7 @@ class RobotPart:
     marks: list[int]
     tracked: bool
     noise: tuple[FloatArray, FloatArray, FloatArray]
+    lifted: bool = False
 
     @property
     def lead(self) -> int:
@@ -79,7 +81,7 @@ class Undescribed:
     """Re-tuned numbers that no description holds; see `ModelNumbers`.
 
     Attributes:
-        unreported: of the torques of all drives and of all steerings (2, 2).
+        unreported: of the torques of all joints (n, 2, 2), or of those of all drives and all steerings (2, 2).
         torque_lag: [s].
         lean, detuning: of the chassis on its springs (2,) [s^2].
     """
@@ -90,10 +92,16 @@ class Undescribed:
     detuning: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(2))
 
     @classmethod
-    def of(cls, retuned: Mapping[str, float]) -> Undescribed:
-        """Take them from all that were re-tuned, by name."""
+    def of(cls, retuned: Mapping[str, float], casters: Sequence[str]) -> Undescribed:
+        """Take them from all that were re-tuned, by name, of a robot with such casters."""
         lean, detuning = ([retuned.get(f"suspension.{kind}.{axis}", 0.0) for axis in "xy"] for kind in ("lean", "detuning"))
-        unreported = [[retuned.get(f"torque_report.{axis}{kind}", 0.0) for kind in ("", "_behind")] for axis in AXIS_NAMES]
+
+        def reported(name: str, axis: str, kind: str) -> float:
+            return sum(retuned.get(f"torque_report.{axis}{kind}{of}", 0.0) for of in ("", f"/{name}"))
+
+        unreported = [
+            [[reported(name, axis, kind) for kind in ("", "_behind")] for axis in AXIS_NAMES] for name in casters
+        ]  # fmt: skip
         return cls(np.array(unreported), retuned.get("torque_lag", 0.0), np.array(lean), np.array(detuning))
 
     def among(self, numbers: ModelNumbers) -> ModelNumbers:
@@ -111,8 +119,11 @@ class Undescribed:
         return given
 
 
-def robot_windows(robot: RobotDescription, recordings: Sequence[Recording]) -> Windows:
-    """Return the windows of recordings with torques in which the wheels do not slide, of pieces that are long enough."""
+def robot_windows(robot: RobotDescription, recordings: Sequence[Recording], lifted: bool = False) -> Windows:
+    """Return the windows of recordings with torques in which the wheels do not slide, of pieces that are long enough.
+
+    Where the wheels are `lifted` off the ground they cannot.
+    """
     numbers = ModelNumbers.of(as_it_really_is(robot))
     parts, change, recording, begin = [], [], [], []
     for index, item in enumerate(recordings):
@@ -121,7 +132,7 @@ def robot_windows(robot: RobotDescription, recordings: Sequence[Recording]) -> W
         motions = with_pose(read_motions(robot, item, index, cutoff, with_torque=True), numbers)
         for motion, (path, tracked) in zip(motions, paths(item, motions), strict=True):
             starts, marks = window_rows(motion.rate, len(motion.time), max(1, round(LEAD * motion.rate)))
-            part = RobotPart(numbers, motion, path, starts, marks, tracked, _noise(item))
+            part = RobotPart(numbers, motion, path, starts, marks, tracked, _noise(item), lifted)
             parts.append(part)
             change.append(_changes(part))
             recording.append(np.full(len(starts), index))
@@ -183,7 +194,8 @@ def _changes(part: RobotPart) -> FloatArray:
     seen = _signals(part, motion.position, motion.velocity, part.path)
     change = _squares(seen[ends] - seen[part.starts][:, None])
     casters = tuple(map(str, range(motion.position.shape[1])))
-    usable = ~sliding(part.numbers, motion, ChannelLayout(casters, balanced=True, imu=False, pose=False))
+    layout = ChannelLayout(casters, balanced=True, imu=False, pose=False)
+    usable = np.ones(len(motion.time), dtype=bool) if part.lifted else ~sliding(part.numbers, motion, layout)
     # A window can be judged as long as nothing slid since it began, its lead included, and something moved.
     slid = np.concatenate([[0], np.cumsum(~usable)])
     still = np.concatenate([[0], np.cumsum(np.any(np.abs(motion.velocity[:, :, DRIVE]) > STILL_SPEED, axis=1))])
@@ -193,9 +205,12 @@ def _changes(part: RobotPart) -> FloatArray:
 
 
 def _signals(part: RobotPart, position: FloatArray, velocity: FloatArray, path: FloatArray) -> FloatArray:
-    """All signals (..., 2n + 6): twist of the wheels, drive rates, steering rates, pose; NaN without a tracker."""
-    twist = wheel_twist(part.numbers, position[..., STEER], velocity)
-    pose = path if part.tracked else np.full_like(path, np.nan)
+    """All signals (..., 2n + 6): twist of the wheels, drive rates, steering rates, pose; NaN without a tracker.
+
+    Off the ground wheels make no twist.
+    """
+    twist = np.full_like(path, np.nan) if part.lifted else wheel_twist(part.numbers, position[..., STEER], velocity)
+    pose = path if part.tracked and not part.lifted else np.full_like(path, np.nan)
     return np.concatenate([twist, velocity[..., DRIVE], velocity[..., STEER], pose], axis=-1)
 
 
@@ -269,12 +284,14 @@ def _simulated(robot: RobotDescription, part: RobotPart, undescribed: Undescribe
     substeps = int(np.ceil(1.0 / (motion.rate * STEP) - 1e-6))
     # The torques were measured behind whatever happens to the commands.
     behind = tuple(i for i in robot.physics if not isinstance(get(i.name), ActuatorEffect))
-    plant = ReducedPlant(dataclasses.replace(robot, physics=behind), 1.0 / (motion.rate * substeps))
+    plant = ReducedPlant(dataclasses.replace(robot, physics=behind), 1.0 / (motion.rate * substeps), part.lifted)
     lead, last = part.lead, part.marks[-1]
     rows, _ = rows_of(part.starts - lead, np.arange(lead + last), len(motion.time))
     set_at = np.round(np.linspace(0, lead, SETTINGS + 1)).astype(np.int64)
     first = part.starts[:, None] - lead + set_at
-    twist, relaxed_slip = _rolling(robot, undescribed.among(own), motion)
+    twist, relaxed_slip = np.zeros_like(part.path), np.zeros_like(motion.position)
+    if not part.lifted:
+        twist, relaxed_slip = _rolling(robot, undescribed.among(own), motion)
     starts = WindowStarts(
         set_at, motion.time[first[:, 0]], part.path[first], twist[first], motion.position[first], motion.velocity[first],
         relaxed_slip[first],

@@ -219,7 +219,7 @@ class RobotSubject:
         subject = RobotSubject(retuned_robot(robot, retuned))
         as_it_really_is(subject.robot)
         subject._cutoff, subject._lifted = self._cutoff, self._lifted
-        subject._undescribed = Undescribed.of(retuned)
+        subject._undescribed = Undescribed.of(retuned, self.robot.caster_names)
         return subject
 
     def mapping(self) -> dict[str, Any]:
@@ -261,10 +261,10 @@ class RobotSubject:
         return responses_in_words(speed_responses(self._seen_robot(), [o.recording for o in opened]))
 
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
-        """Return the windows to simulate; None without torques or ground, or for a robot that cannot be driven by them."""
+        """Return the windows to simulate; None without torques, or for a robot on the ground that cannot be driven by them."""
         recordings = [o.recording for o in opened]
-        if self._off_ground:
-            return None
+        if self._off_ground and all(map(_has_effort, recordings)):
+            return robot_windows(self.robot, recordings, lifted=True)
         without_offset = bool(np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3))
         if without_offset or self.robot.fixed_wheels or not all(map(_has_effort, recordings)):
             return None
