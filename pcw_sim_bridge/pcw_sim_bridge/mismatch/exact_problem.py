@@ -53,7 +53,7 @@ class ExactProblem:
         if white:
             noise = white_noise_model(residual, problem.valid)
         else:
-            noise = fit_noise_model(residual, problem.valid, problem.segment)
+            noise = fit_noise_model(residual, problem.valid, problem.segment, problem.apart)
         # What is large at the first look may be an event, which held down like an outlier would never be found.
         weights = reliability(problem, residual, robust=not by_channel)
         return WhitenedRegression(problem, noise, weights, None if by_channel else self.block)

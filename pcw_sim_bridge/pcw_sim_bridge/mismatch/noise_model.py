@@ -253,8 +253,15 @@ def _huber_deviation(values, deviation):  # type: ignore[no-untyped-def]
     return deviation
 
 
-def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -> NoiseModel:
-    """Estimate the noise model from a residual (T, C)."""
+def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray, apart: bool = False) -> NoiseModel:
+    """Estimate the noise model from a residual (T, C).
+
+    Args:
+        residual: what is left; valid: where it is (T, C); segment: of every sample (T,).
+        apart: each channel has effects of its own. What one of them leaves there while it is named is the whole residual, and
+            smooth: an autoregression makes more slow noise of it than it can hold. Where all effects are in all channels that
+            keeps out of the search what a large one leaves of itself while it is searched, and stays so.
+    """
     channels = residual.shape[1]
     longest = max((piece.stop - piece.start for piece in segment_slices(segment)), default=0)
     order = int(max(0, min(AUTOREGRESSION_ORDER, longest // 20)))
@@ -262,7 +269,7 @@ def fit_noise_model(residual: FloatArray, valid: BoolArray, segment: IntArray) -
     for channel in range(channels):
         coefficients, deviation = _autoregression(residual[:, channel], valid[:, channel], segment, order)
         slow = slow_power(residual[:, channel], valid[:, channel], segment)
-        whole = float(np.sum(residual[valid[:, channel], channel] ** 2))
+        whole = float(np.sum(residual[valid[:, channel], channel] ** 2)) if apart else np.inf
         filters.append(_whitening_taps(coefficients, deviation, slow, whole))
     length = max(len(taps) for taps in filters)
     length = max(1, min(length, longest // 4 + 1))

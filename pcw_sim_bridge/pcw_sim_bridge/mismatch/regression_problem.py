@@ -314,6 +314,7 @@ class RegressionProblem:
         powers: of parameters of effects (term, shape, position) that what they do there is in proportion to, where not to
             the parameters themselves.
         remarks: what a reader has to know of the recordings.
+        apart: whether each channel has effects of its own, those of one joint.
         shaken: whether one of these is that wheels shake; limited: whether one is that torques use up their friction.
         near: how columns of a term follow from its derivatives, by term; see `around`.
     """
@@ -342,6 +343,7 @@ class RegressionProblem:
     point: Point | None = None
     powers: Mapping[tuple[int, tuple[tuple[str, float], ...], int], float] = dataclasses.field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    apart: bool = False
     shaken: bool = False
     limited: bool = False
     near: Mapping[int, _NearSecant] = dataclasses.field(default_factory=dict)

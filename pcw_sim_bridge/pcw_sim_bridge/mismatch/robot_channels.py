@@ -187,6 +187,7 @@ class RobotProblemBuilder:
             derive=functools.partial(self._derive, differences, terms),
             softened=self._softened if self.layout.balanced else None,
             remarks=(*shaken, *limited),
+            apart=self.layout.lifted,
             shaken=bool(shaken),
             limited=bool(limited),
         )
