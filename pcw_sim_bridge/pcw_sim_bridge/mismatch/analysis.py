@@ -27,6 +27,7 @@ from .explanation import (
     strained_of_the_balance,
 )
 from .findings import (
+    FLAG_PROBABILITY,
     ChannelFinding,
     EffectFinding,
     Findings,
@@ -54,7 +55,6 @@ from .whitened_regression import Fit, predicted
 
 Progress = Callable[[str], None]
 
-FLAG_PROBABILITY = 1e-3
 # The scraps between shaking are no sample of the motion: they look like every kind of effect.
 LEAST_UNDISTURBED = 0.2
 # Least to say anything: usable samples per channel and unknown, and time of usable motion.

@@ -13,6 +13,7 @@ from .regression_problem import FloatArray
 Interval = tuple[float, float]
 
 FORMAT = "pcw_mismatch/1"
+FLAG_PROBABILITY = 1e-3  # of a channel's residual being noise and tolerances, below which it departs
 VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
 REFUSED = "fitted but did not help held out"  # an outcome of the ladder
 SHORT_ENOUGH = 100  # characters of a formula that stands in a plain sentence

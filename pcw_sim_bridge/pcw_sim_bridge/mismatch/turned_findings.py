@@ -10,6 +10,7 @@ import numpy as np
 from pcw_description.effect_instance import EffectInstance
 
 from .findings import (
+    FLAG_PROBABILITY,
     ChannelFinding,
     EffectFinding,
     Findings,
@@ -59,8 +60,8 @@ def turned_findings(
         verdict="explained",
         inputs=inputs,
         channels=tuple(
-            ChannelFinding(name, units[name], float(rms), float(floor), 0.0, True)
-            for name, rms, floor in zip(WRENCH, turned.before, turned.after, strict=True)
+            ChannelFinding(name, units[name], float(rms), float(floor), float(p_value), bool(p_value < FLAG_PROBABILITY))
+            for name, rms, floor, p_value in zip(WRENCH, turned.before, turned.after, turned.p_values, strict=True)
         ),
         locations=(
             LocationFinding(
@@ -80,7 +81,6 @@ def turned_findings(
         fit=FitFinding(
             source="stretches of the fitted recordings, forces and moment, each by the zero that the others tell",
             inverse_nrmse=(before, after), rollout={}, gap_closed=float(np.clip(1.0 - after / before, 0.0, 1.0)),
-            inverse_floor=0.0,
         ),
         ladder=(),
         traces=(),

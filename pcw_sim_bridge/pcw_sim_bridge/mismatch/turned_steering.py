@@ -58,6 +58,7 @@ class TurnedSteering:
         probability: that it is this caster's.
         measured, before, after: rms of the wrench on the base that forces make, and of what is left of it as described and,
             every stretch of time by the offset that the others tell, with the offset (3,) [N, N, N m].
+        p_values: of so much more being left before by chance, of every second anew (3,).
         part: of the size of all forces that is left before and after.
         fighting: part of the samples in which wheels slide with that zero, too: they are driven against each other.
     """
@@ -69,6 +70,7 @@ class TurnedSteering:
     measured: FloatArray
     before: FloatArray
     after: FloatArray
+    p_values: FloatArray
     part: tuple[float, float]
     fighting: float
 
@@ -114,11 +116,14 @@ def turned_steering(
     # What is left is no noise, and may as well be a part of that wheel's force that points another way.
     by_chance = float(stats.t.ppf(0.975, STRETCHES - 1)) * math.hypot(chance, MODEL_DEVIATION * turn)
     half = math.hypot(by_chance, after / forces.of_wheel[best])
-    odds = np.exp(-forces.seconds / STRETCH * np.log(least / least[best]))
+    count = forces.seconds / STRETCH
+    odds = np.exp(-count * np.log(least / least[best]))
+    left_before, left_after = _rms(left), _rms(held_out)
     offset = -math.remainder(turn, math.tau)
     return TurnedSteering(
         caster=forces.layout.casters[best], offset=offset, interval=(offset - half, offset + half),
-        probability=float(odds[best] / odds.sum()), measured=_rms(measured), before=_rms(left), after=_rms(held_out),
+        probability=float(odds[best] / odds.sum()), measured=_rms(measured), before=left_before, after=left_after,
+        p_values=stats.f.sf((left_before / left_after) ** 2, count, count),
         part=(before / forces.typical, after / forces.typical), fighting=fighting,
     )  # fmt: skip
 
