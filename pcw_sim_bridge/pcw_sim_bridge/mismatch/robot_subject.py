@@ -42,7 +42,7 @@ from .robot_channels import RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
 from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_squares
-from .rolling_model import model_awaits_compiling
+from .rolling_model import WRENCH, model_awaits_compiling
 from .rollout import Windows
 from .sensor_axes import unlike_axes
 from .speed_response import responses_in_words, speed_responses
@@ -52,6 +52,7 @@ from .turned_steering import TurnedSteering
 from .wheel_agreement import contradictions
 
 OFF_GROUND = "joint_states: the wheels turn and the robot stands: they are off the ground, and each joint is judged by itself"
+UNBALANCED = 0.15  # of the force that torques make, which a steering that is turned far leaves at least
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 
 
@@ -180,6 +181,11 @@ class RobotSubject:
 
     def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> TurnedSteering | None:
         """Return the one steering whose zero makes wheels work against each other, where they do."""
+        # Where forces do nearly what the robot does, or there are none, a second look would be time lost.
+        force = [c for c, channel in enumerate(problem.channels) if channel.name in WRENCH[:2]]
+        left, made = (float(np.sum(values[:, force] ** 2)) for values in (problem.residual, problem.measured))
+        if not force or left < UNBALANCED**2 * made:
+            return None
         return self._builder(opened).turned_steering(problem.limited)
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
