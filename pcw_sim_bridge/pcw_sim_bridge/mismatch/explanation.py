@@ -49,7 +49,7 @@ from .whitened_regression import Fit, Instance, WhitenedRegression
 # A look-alike within so many nats of a named effect cannot be told from it.
 AMBIGUOUS = 3.0
 # An effect of this part of the size that it had without a refinement was what that refinement is.
-NEXT_TO_NOTHING = 0.1
+NEXT_TO_NOTHING = 0.2
 # What a refinement of a named effect has to make up for against a further plain effect: the plain laws come first.
 REFINEMENT_LOG_PRIOR = -3.0
 # Half-width of 95 % of a Gaussian, in deviations.
