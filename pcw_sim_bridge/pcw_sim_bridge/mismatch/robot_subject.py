@@ -267,14 +267,12 @@ class RobotSubject:
         return responses_in_words(speed_responses(self._seen_robot(), [o.recording for o in opened]))
 
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
-        """Return the windows to simulate; None without torques, or for a robot on the ground that cannot be driven by them."""
+        """Return the windows to simulate; None without torques, or for a robot that cannot be driven by them."""
         recordings = [o.recording for o in opened]
-        if self._off_ground and all(map(_has_effort, recordings)):
-            return robot_windows(self.robot, recordings, lifted=True)
         without_offset = bool(np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3))
         if without_offset or self.robot.fixed_wheels or not all(map(_has_effort, recordings)):
             return None
-        return robot_windows(self.robot, recordings)
+        return robot_windows(self.robot, recordings, self._off_ground)
 
     def rollout(self, windows: Windows) -> FloatArray:
         """Return the squared errors of the reduced plant under the measured torques, (W, H, S)."""
