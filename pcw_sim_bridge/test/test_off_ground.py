@@ -117,6 +117,15 @@ def test_the_gyro_tells_as_well(tmp_path: Path) -> None:
     assert not wheels_off_ground(robot, recording)
 
 
+def test_a_tracker_that_measured_nothing_tells_nothing(tmp_path: Path) -> None:
+    robot = load_robot("tidybot2")
+    recording = Recording.open(recorded(tmp_path / "run", "tidybot2", LIFTED, 15, 1), robot)
+    assert recording.ground_truth is not None and wheels_off_ground(robot, recording)
+    blind = np.full_like(recording.ground_truth.pose, np.nan)
+    recording.ground_truth = dataclasses.replace(recording.ground_truth, pose=blind)
+    assert not wheels_off_ground(robot, recording)
+
+
 @pytest.mark.parametrize("robot", ["thesis", "tidybot2", "xr4000"])
 def test_without_sensors_the_torques_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: str) -> None:
     run = recorded(tmp_path / "run", robot, LIFTED, 30, 6)

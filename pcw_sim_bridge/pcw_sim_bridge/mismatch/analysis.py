@@ -38,7 +38,6 @@ from .findings import (
     Trace,
     UnknownFinding,
 )
-from .found_effect import effect_instance
 from .generated_effect import NoSuchKernelError, generate
 from .late_torques import TORQUE_LAG, with_late_torques
 from .locations import locate, locate_leftover, walked
@@ -158,7 +157,7 @@ def analyse(
     explanation = proof.explanation
     problem = explanation.search.problem
     pairs, gaping = doubted_in_a_gap(
-        [(named, _instance(named)) for named in explanation.named], 0.0 if proof.untuned else proof.finding.gap_closed
+        [(named, named.effect) for named in explanation.named], 0.0 if proof.untuned else proof.finding.gap_closed
     )
     everything, crowded = doubted_in_a_crowd([*pairs, *commands.named])
     instances = [instance for _, instance in everything]
@@ -248,12 +247,6 @@ def _with_laws(
     laws = [EffectInstance(effect.name, effect.target, effect.parameters, None) for effect in made]
     with also_known(effect.loaded for effect in made):
         return subject.patched([*instances, *laws], numbers).mapping() if laws else None
-
-
-def _instance(named: NamedTerm) -> EffectInstance:
-    """Return a named effect with all its parameters, as it stands under `physics:`."""
-    values = {name: estimate.value for name, estimate in named.estimates.items()}
-    return effect_instance(named.term.effect, named.term.target, values, named.term.axis)
 
 
 def _reported_numbers(explanation: Explanation) -> dict[str, float]:

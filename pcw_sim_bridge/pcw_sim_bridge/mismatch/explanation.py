@@ -24,10 +24,12 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from scipy import stats
 
+from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects, get
 
 from .effect_gates import EffectGates
 from .evidence_selection import EffectSearch, Selection
+from .found_effect import effect_instance
 from .noise_model import channel_deviations
 from .open_set import SMALLEST_SHARE, Leftover, OpenSetResult, OpenSetTest, is_unknown, judge
 from .outline_search import Outlines
@@ -99,6 +101,12 @@ class NamedTerm:
     loss: float
     held_out: float
     contribution: FloatArray
+
+    @property
+    def effect(self) -> EffectInstance:
+        """The effect with all its parameters, as it stands under `physics:`."""
+        values = {name: estimate.value for name, estimate in self.estimates.items()}
+        return effect_instance(self.term.effect, self.term.target, values, self.term.axis)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -386,10 +386,10 @@ class Findings:
         """What "no_mismatch" says and does not say, as one sentence without its full stop."""
         where = ""
         names = [channel.name for channel in self.channels]
-        if any(name.startswith("steer_torque/") for name in names) and not any("force" in name for name in names):
-            where = " in the joints (off the ground nothing else could be judged)"
-        elif not any("force" in name for name in names):
-            where = f" in {', '.join(channel.name for channel in self.channels)} (forces could not be judged)"
+        if not any("force" in name for name in names):
+            where = f" in {', '.join(names)} (forces could not be judged)"
+            if any(name.startswith("steer_torque/") for name in names):
+                where = " in the joints (off the ground nothing else could be judged)"
         labels = [step.description.removeprefix("drop ") for step in self.ladder if step.outcome.startswith(REFUSED)]
         refused = [f"a dependence on {label.partition(' by ')[2]}" if " by " in label else label for label in labels]
         if refused:  # nothing proved, which is not the same as nothing there

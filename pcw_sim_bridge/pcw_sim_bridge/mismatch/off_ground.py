@@ -74,8 +74,9 @@ def wheels_turn_alone(problem: RegressionProblem) -> bool:
 
 
 def _sampled(time: FloatArray, stamp: FloatArray, values: FloatArray) -> FloatArray:
+    """Values at other times; NaN, which is no speed at all, where none was measured."""
     known = np.isfinite(values)
-    return np.interp(time, stamp[known], values[known])
+    return np.interp(time, stamp[known], values[known]) if known.any() else np.full_like(time, np.nan)
 
 
 def _size(*values: FloatArray) -> float:

@@ -343,7 +343,7 @@ class Prover:
         return (min(found)[1], "the error is no smaller with it") if found else None
 
     def _impossible(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
-        """An effect that makes a robot of the patch that cannot be: without it, or at least with it gone, that can."""
+        """An effect with which the patched robot cannot be, and without which it can; the first if that is none of them."""
         if self._can_be(explanation, held_out, None) or not held_out.proposed:
             return None
         guilty = [index for index in held_out.proposed if self._can_be(explanation, held_out, index)]
@@ -353,10 +353,7 @@ class Prover:
         """Whether there is such a robot, by all that was fitted and by every fold of it."""
         problem, numbers = explanation.search.problem, self._numbers(explanation)
         left_out = None if without is None else held_out.instances[without]
-        effects = [
-            effect_instance(n.term.effect, n.term.target, {k: e.value for k, e in n.estimates.items()}, n.term.axis)
-            for n in explanation.named if n.instance != left_out
-        ]
+        effects = [named.effect for named in explanation.named if named.instance != left_out]
         try:
             self.subject.patched(effects, numbers)
             with also_known(self.laws.effects):

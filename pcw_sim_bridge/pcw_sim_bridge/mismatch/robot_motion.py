@@ -193,7 +193,7 @@ def read_motions(
                     loops=loops[keep].copy(),
                     imu=sensed[keep, :3],
                     pose=base_pose(robot, pose[keep]),
-                    tracked_twist=_in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),
+                    tracked_twist=in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),
                     shaking=shaking.speed[keep].copy(),
                     shaking_frequency=shaking.frequency,
                 )
@@ -245,7 +245,7 @@ def base_pose(robot: RobotDescription, pose: FloatArray) -> FloatArray:
     return np.stack([pose[:, 0] - c * x + s * y, pose[:, 1] - s * x - c * y, yaw], axis=1)
 
 
-def _in_body(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
+def in_body(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
     """Turn a velocity (T, 3) in the world into base_link."""
     c, s = np.cos(yaw), np.sin(yaw)
     along, across = c * velocity[:, 0] + s * velocity[:, 1], c * velocity[:, 1] - s * velocity[:, 0]

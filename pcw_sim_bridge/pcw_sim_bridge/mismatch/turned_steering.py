@@ -23,7 +23,7 @@ from .all_cores import on_all_cores
 from .noise_model import huber_weights
 from .regression_problem import BoolArray, FloatArray
 from .robot_effects import ChannelModel
-from .robot_motion import RobotMotion
+from .robot_motion import RobotMotion, in_body
 from .robot_nuisances import MODEL_DEVIATION
 from .rolling_model import (
     ChannelLayout,
@@ -239,10 +239,7 @@ def with_turn(numbers: ModelNumbers, caster: int | None, turn: float) -> ModelNu
 def _twist(motion: RobotMotion, numbers: ModelNumbers, without: int | None) -> FloatArray:
     """Twist of base_link (T, 3) by the tracked pose, or by all wheels but one."""
     if np.isfinite(motion.tracked_twist).mean() > TRACKED_PART:
-        velocity = derivative(motion.pose, motion.rate)
-        c, s = np.cos(motion.yaw), np.sin(motion.yaw)
-        along, across = c * velocity[:, 0] + s * velocity[:, 1], c * velocity[:, 1] - s * velocity[:, 0]
-        return np.stack([along, across, velocity[:, 2]], axis=1)
+        return in_body(derivative(motion.pose, motion.rate), motion.yaw)
     some = numbers.copy()
     kept = [i for i in range(len(numbers.radius)) if i != without]
     for name in ("steer_axis", "caster_offset", "radius", "steer_zero"):
