@@ -824,3 +824,25 @@ def test_nothing_missing_is_an_empty_patch_without_harm(tmp_path: Path) -> None:
     for before, after in (proof["inverse_nrmse"], *proof["rollout"].values()):
         assert before == after
     assert proof["harm"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("help_and_work", "doubted", "refused"),
+    [
+        ((-3.7, 7.0), False, False),  # what such data say for an effect that is there spreads by as much
+        ((-4.6, 7.0), False, True),
+        ((-0.1, 60.0), False, True),
+        ((-0.1, 60.0), True, False),  # as look-alikes are separated
+        ((-3.1, 60.0), True, True),
+        ((-9.0, 4.0), False, False),  # next to nothing of it is there
+    ],
+)
+def test_held_out_data_that_hardly_hold_an_effect_do_not_refuse_it(
+    help_and_work: tuple[float, float], doubted: bool, refused: bool
+) -> None:
+    """A friction of 0.106 N m, right to a thousandth and by 150 nats, was refused by a recording that hardly had it."""
+    instance = Instance(0, (), (0,))
+    named = SimpleNamespace(instance=instance, probability=1.0, ambiguous_with=("another",) if doubted else ())
+    held_out = SimpleNamespace(proposed=(0,), instances=(instance,), help_of=lambda index: help_and_work)
+    found = Prover._useless(SimpleNamespace(), SimpleNamespace(named=(named,)), held_out)  # type: ignore[arg-type]
+    assert (found is not None) is refused

@@ -10,7 +10,7 @@ import pytest
 from scipy import signal
 
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, Selection
-from pcw_sim_bridge.mismatch.explanation import explain, named_terms, search_effects
+from pcw_sim_bridge.mismatch.explanation import _telling, explain, named_terms, search_effects
 from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, shared_beliefs
@@ -602,6 +602,34 @@ def test_a_rival_that_does_as_well_elsewhere_is_said_to_be_one():
     named = named_terms(search, selection)[0]
     assert named.ambiguous_with == ("other",)
     assert named.probability == pytest.approx(1.0 / (1.0 + math.exp(-1.0)), abs=1e-3)
+
+
+def test_what_is_named_beside_an_effect_is_no_rival_of_it():
+    """A slope was right and believed by 3 %, for a motor that was tried in its place and is off, too."""
+    time = np.arange(3000) / RATE
+    columns = np.sin(2.1 * time), np.sin(3.7 * time)
+    left = 2.0 * columns[0] + columns[1] + NOISE * np.random.default_rng(4).standard_normal(len(time))
+    problem = linear_problem(left, {"one": (columns[0], 100.0), "other": (columns[1], 100.0)})
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection = search.conclude((Instance(0, (), (0,)), Instance(1, (), (0,))), 5.0)
+    search.where_exact[0, 1] = 3.6
+    assert [(entry.ambiguous_with, entry.probability > 0.999) for entry in named_terms(search, selection)] == 2 * [((), True)]
+
+
+@pytest.mark.parametrize(("rivals", "names"), [(5, ["one"]), (6, [])])
+def test_what_nearly_anything_would_do_is_not_named(rivals, names):
+    """Of a constant load 98 others did as well: a part of what was left, of which no name says anything."""
+    time = np.arange(3000) / RATE
+    column = np.sin(2.1 * time)
+    left = 2.0 * column + NOISE * np.random.default_rng(4).standard_normal(len(time))
+    alike = {f"other_{k}": (column, 100.0) for k in range(rivals)}
+    problem = linear_problem(left, {"one": (column, 100.0), **alike})
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    selection, entries = _telling(search, search.conclude((Instance(0, (), (0,)),), 5.0))
+    assert [entry.term.effect for entry in entries] == names
+    assert len(selection.fit.instances) == len(names)
+    dropped = [step.outcome for step in search.ladder]
+    assert dropped == ([] if names else ["as good as 6 others"])
 
 
 @pytest.mark.parametrize(("off", "loose", "names"), [(8.0, False, ["same"]), (8.0, True, []), (20.0, True, ["same"])])

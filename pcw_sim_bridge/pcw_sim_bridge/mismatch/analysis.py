@@ -44,6 +44,7 @@ from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
 from .regression_problem import HEALTHY, STRAINED, TAKEN_OVER, FloatArray, RegressionProblem
+from .ripple_findings import beside_ripples, ripple_findings, with_ripples
 from .selection_settings import SelectionSettings
 from .set_growth import LadderStep
 from .subject import Subject
@@ -116,12 +117,20 @@ def analyse(
     for told in lengths:
         progress(told)
     progress("building the channels")
-    problem = subject.problem(opened)
+    problem, sizes = side_by_side(lambda: subject.problem(opened), lambda: subject.ripples(opened))
     known = [*opened, *held_out]
     right = subject.put_right(problem, known)
     if right is not known:
         opened, held_out = right[: len(opened)], right[len(opened) :]
         progress(f"{', '.join(one.finding.path for one in right)}: {right[0].finding.warnings[-1]}")
+        problem, sizes = subject.problem(opened), subject.ripples(opened)
+    plain, ripples = subject, CommandFindings()
+    if sizes:
+        # The channels judge what is left: what they show of it where joints turn slowly would pass for something else.
+        ripples = ripple_findings(sizes, subject.with_ripples(sizes, held_out), subject.band(), seed)
+        for _, instance in ripples.named:
+            progress(f"above {subject.band():.3g} Hz: {plain.statement(instance)}")
+        subject = plain.describing([instance for _, instance in ripples.named])
         problem = subject.problem(opened)
     inputs = tuple(o.finding for o in (*opened, *held_out))
     judged = problem.valid.any(axis=1)
@@ -129,17 +138,17 @@ def analyse(
     turned = subject.turned_steering(problem, opened)
     if turned is not None and (turned.fighting > FIGHTING or usable < LEAST_DURATION):
         found = turned_findings(subject, turned, problem, inputs, (*lengths, *problem.remarks), time.monotonic() - begun)
-        return Analysis(found, subject.patched([instance_of(turned)], {}))
+        return Analysis(found, plain.patched([instance_of(turned)], {}))
     if usable < LEAST_DURATION or (problem.shaken and judged.mean() < LEAST_UNDISTURBED):
         note = (
             f"only {usable:.1f} s of usable motion (moving, no gross slip), {100 * judged.mean():.0f} % of what was recorded; "
             f"at least {LEAST_DURATION:g} s are needed, and {100 * LEAST_UNDISTURBED:.0f} % where wheels shake"
         )
-        notes = (note, *lengths, *problem.remarks)
+        notes = (note, *lengths, *problem.remarks, *ripples.notes)
         empty = Findings(
             subject.name, "insufficient_data", inputs, (), (), (), (), (), None, (), (), notes, time.monotonic() - begun
         )
-        return Analysis(empty, subject)
+        return Analysis(empty, plain)
     samples, channels = problem.residual.shape
     progress(f"searching {len(problem.terms)} candidates in {samples} samples of {channels} channels")
 
@@ -153,17 +162,18 @@ def analyse(
     )
     commands = with_late_torques(commands, commanded, explanation)
     progress("proving it on held-out data")
-    proof = prover.prove(explanation, bool(commands.named))
-    explanation = proof.explanation
+    proof = prover.prove(explanation, bool(commands.named or ripples.named))
+    explanation, shaken = beside_ripples(proof.explanation, ripples)
     problem = explanation.search.problem
     pairs, gaping = doubted_in_a_gap(
         [(named, named.effect) for named in explanation.named], 0.0 if proof.untuned else proof.finding.gap_closed
     )
-    everything, crowded = doubted_in_a_crowd([*pairs, *commands.named])
+    everything, crowded = doubted_in_a_crowd([*with_ripples(pairs, ripples.named), *commands.named])
+    commands = commands.and_also(ripples)
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
     numbers = {name: value for name, value in _reported_numbers(explanation).items() if name not in proof.untuned}
-    patched = subject.patched(instances, numbers) if instances else subject
+    patched = plain.patched(instances, numbers) if instances else plain
     leftovers = (*explanation.leftovers, *commands.leftovers)
     unknown = _unknown(leftovers, proof.laws, [str(path) for path in fit])
     verdict = {
@@ -197,13 +207,13 @@ def analyse(
         ),
         notes=(
             *lengths, *gaping, *crowded, *_notes(explanation, retuned, other is not None, proof, fit, commands.numbers),
-            *commands.notes, *responses,
+            *commands.notes, *shaken, *responses,
         ),
         seconds=time.monotonic() - begun,
         residual_map=_residual_map(explanation, path),
         absent=subject.absent(opened),
     )
-    return Analysis(findings, patched, _with_laws(subject, instances, numbers, unknown))
+    return Analysis(findings, patched, _with_laws(plain, instances, numbers, unknown))
 
 
 def doubted_in_a_gap(

@@ -23,6 +23,7 @@ from .axis_channels import AxisProblemBuilder
 from .axis_rollout import axis_windows, rollout_floor, rollout_squares
 from .findings import InputFinding
 from .regression_problem import FloatArray, RegressionProblem
+from .ripple_sizes import RippleSize
 from .rollout import Windows
 from .subject import Opened, file_digest
 
@@ -72,6 +73,22 @@ class AxisSubject:
 
     def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> None:
         """Return None: an axis has none."""
+
+    def ripples(self, opened: Sequence[Opened]) -> tuple[()]:
+        """Return nothing: the one channel of an axis is searched for ripples as it is."""
+        return ()
+
+    def with_ripples(self, sizes: Sequence[RippleSize], opened: Sequence[Opened]) -> tuple[()]:
+        """Return nothing."""
+        return ()
+
+    def band(self) -> float:
+        """Return infinity: there is nothing above the channel."""
+        return math.inf
+
+    def describing(self, effects: Sequence[EffectInstance]) -> AxisSubject:
+        """Return the axis with effects in its description."""
+        return self.patched(effects, {})
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what returns the problem: all candidates of one channel are made in no time."""

@@ -57,6 +57,12 @@ class CommandFindings:
     notes: tuple[str, ...] = ()
     numbers: tuple[str, ...] = ()
 
+    def and_also(self, other: CommandFindings) -> CommandFindings:
+        """Return these findings and others of joints."""
+        return CommandFindings(*(
+            (*getattr(self, field.name), *getattr(other, field.name)) for field in dataclasses.fields(self)
+        ))  # fmt: skip
+
 
 def command_findings(
     problems: Sequence[RegressionProblem],

@@ -50,6 +50,8 @@ from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
 AMBIGUOUS = 3.0
+# What more than so many others would do as well is nothing that a name says anything of.
+MOST_ALIKE = 5
 # An effect of this part of the size that it had without a refinement was what that refinement is.
 NEXT_TO_NOTHING = 0.2
 # What a refinement of a named effect has to make up for against a further plain effect: the plain laws come first.
@@ -209,10 +211,11 @@ def explain(
     judgement = judge(search, selection, result)
     search, result = judgement.search, judgement.result
     selection = search.balanced(_taking_over(search, search.polished(judgement.selection)))
+    selection, entries = _telling(search, selection)
     problem = search.problem
     named = tuple(
         dataclasses.replace(entry, probability=entry.probability * judgement.beliefs.get(entry.instance.term, 1.0))
-        for entry in named_terms(search, selection)
+        for entry in entries
         if not is_unknown(problem, entry.instance)
     )
     if refined is not None:
@@ -270,6 +273,22 @@ def search_effects(
 def _strains(problem: RegressionProblem, fit: Fit) -> dict[str, float]:
     """By how many tolerances the numbers of the description come out of it."""
     return {n.name: abs(float(mean)) / n.deviation for n, mean in zip(problem.nuisances, fit.mean, strict=False)}
+
+
+def _telling(search: EffectSearch, selection: Selection) -> tuple[Selection, tuple[NamedTerm, ...]]:
+    """The selection without effects in whose place nearly any other would do, and what is named by it.
+
+    Which of two or three it is an experiment can tell. That any of thirty would do says that something is left, and no more.
+    """
+    while True:
+        entries = named_terms(search, selection)
+        alike = [0 if is_unknown(search.problem, entry.instance) else len(set(entry.ambiguous_with)) for entry in entries]
+        index = int(np.argmax(alike)) if alike else 0
+        if not alike or alike[index] <= MOST_ALIKE:
+            return selection, entries
+        search.note_drop(search.label(entries[index].instance), entries[index].loss, f"as good as {alike[index]} others")
+        rest = tuple(entry.instance for entry in entries if entry is not entries[index])
+        selection = search.conclude(search.made_exact(rest), selection.threshold)
 
 
 def _with_whole_numbers(search: EffectSearch, selection: Selection) -> Selection:
@@ -691,7 +710,11 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     rivals = [without.log_evidence - fit.log_evidence]
     alike = []
     # Far from where the problem is exact now, a first order says little of a rival: what it reached where it is exact counts.
-    where_exact = {rival: odds for (named, rival), odds in search.where_exact.items() if named == own.term}
+    # One that has been named since, beside this effect, is no rival any more.
+    beside = {other.term for other in others}
+    where_exact = {
+        rival: odds for (named, rival), odds in search.where_exact.items() if named == own.term and rival not in beside
+    }
     for position, refined in _refinements(problem, others):
         trial = regression.fit(refined)
         # A refined law in place of a further effect is as likely as that: neither is the plainer one.

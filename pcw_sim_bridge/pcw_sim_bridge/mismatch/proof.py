@@ -35,6 +35,8 @@ from .whitened_regression import Instance
 LEAST_PROBABILITY = 0.01  # of a name: below it stands for another one
 # An effect that moves held-out data by less [nats] was not at work there: nothing speaks for it or against it.
 AT_WORK = 5.0
+# Standard errors by which held-out data have to fall short of what an effect, if it is there, does for them on average.
+SHORT_OF = 3.0
 LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to speak against an effect
 # Of the description's error in a simulation; what adds less to the error is not told from numbers that were re-tuned.
 TELLING_PART = 0.1
@@ -329,7 +331,8 @@ class Prover:
     def _useless(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
         """The effect that adds most to the held-out error, if one adds to it.
 
-        Against one that is said to be ambiguous the held-out data have to speak as clearly as look-alikes are separated.
+        Where an effect has little to do, data that hold it are often foretold no better with it. Against one that is said to
+        be ambiguous the held-out data have to speak as clearly as look-alikes are separated.
         """
         doubted = {named.instance for named in explanation.named if named.ambiguous_with}
         believed = {named.instance: named.probability for named in explanation.named}
@@ -338,7 +341,9 @@ class Prover:
             if believed.get(held_out.instances[index], 1.0) < LEAST_PROBABILITY:
                 return index, "an effect that is not proposed explains by far more"
             nats, work = held_out.help_of(index)
-            if work > AT_WORK and nats <= (-AMBIGUOUS if held_out.instances[index] in doubted else 0.0):
+            # Noise spreads what data that hold it say for it, its work on average, by the root of twice that.
+            least = min(work - SHORT_OF * math.sqrt(2.0 * work), -AMBIGUOUS if held_out.instances[index] in doubted else 0.0)
+            if work > AT_WORK and nats <= least:
                 found.append((nats, index))
         return (min(found)[1], "the error is no smaller with it") if found else None
 

@@ -71,6 +71,9 @@ ROUNDING = 1e-9  # of what wheels roll; contradictions below it are those of ari
 SLOWER = 3.0  # so much less than the residual's is the cut-off of variables with the same noise, which grows with its cube
 RINGING = 1.5  # periods of the cut-off over which the filter's answer to a blow is felt
 SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slips to and fro is less than at its average slip
+# [rad]; a caster that swings so far while it rolls drags by about half its cornering stiffness times the square of that: a
+# thousandth of its load, and as much as the noise of a balance. At 0.07 rad four of them brake a robot of 40 kg by 20 N.
+LARGEST_SWING = 0.01
 SHAKEN_PART = 0.05  # of the samples in which wheels shake is worth a word
 LIMITED_PART = 0.3  # of the samples in which their friction is used up is, too
 # What every model has a little wrong, of each wheel by itself, and not always by as much.
@@ -441,13 +444,24 @@ class RobotProblemBuilder:
         )
 
     def _shaken(self) -> tuple[str, ...]:
-        """That wheels shake, which keeps samples from being judged and can be mended."""
+        """That wheels shake or casters swing, which keeps samples from being judged and can be mended."""
         shaken = np.concatenate([motion.shaking > SHAKING_PART * SLIP_FLOOR for motion in self.motions])
+        swings = np.concatenate([motion.swing for motion in self.motions])
+        swung = swings > LARGEST_SWING
+        told: tuple[str, ...] = ()
+        if np.mean(swung) >= SHAKEN_PART:
+            told = (
+                f"In {100 * np.mean(swung):.0f} % of the samples casters swing about their steering axes by up to "
+                f"{np.quantile(swings, 0.99):.2f} rad, faster than {self.motions[0].cutoff:.3g} Hz, and were not judged: "
+                "casters do that by themselves where they roll fast and nothing holds their steerings (shimmy), and it costs "
+                "speed.",
+            )
         if np.mean(shaken) < SHAKEN_PART:
-            return ()
+            return told
         worst = max(self.motions, key=lambda motion: float(np.mean(motion.shaking)))
         frequency, speed = worst.shaking_frequency, float(np.quantile(worst.shaking, 0.95))
         return (
+            *told,
             f"In {100 * np.mean(shaken):.0f} % of the samples wheels shake at about {frequency:.0f} Hz, by up to "
             f"{speed:.2f} m/s at the ground, and were not judged. A loop of the drives may be too stiff for the tyres and the "
             "delay: lower its gains and record anew.",
@@ -562,7 +576,7 @@ def slipping(numbers: ModelNumbers, motion: RobotMotion, layout: ChannelLayout) 
         bad |= sudden_slip(turned, twist, motion.rate, reach, GROSS * allowed)
     else:
         bad = sudden_slip(tracked, rolled, motion.rate, reach, allowed)
-    return bad | (motion.shaking > SHAKING_PART * allowed)
+    return bad | (motion.shaking > SHAKING_PART * allowed) | (motion.swing > LARGEST_SWING)
 
 
 def used_friction(numbers: ModelNumbers, state: RollingState) -> FloatArray:

@@ -83,6 +83,7 @@ class RobotMotion:
         pose: of base_link by a tracker (T, 3); NaN where not recorded.
         tracked_twist: velocity of what is tracked, in its own axes (T, 3); NaN where not recorded.
         shaking: speed at which the contacts of wheels shake that the filter smooths away (T,) [m/s]; its frequency [Hz].
+        swing: amplitude by which a steering swings that the filter smooths away (T,) [rad].
         lost: what joints seem to lose; None where that matters little, or nobody has looked.
         error: of the torques; None where nobody has looked.
     """
@@ -107,6 +108,7 @@ class RobotMotion:
     tracked_twist: FloatArray
     shaking: FloatArray
     shaking_frequency: float
+    swing: FloatArray
     lost: LostTorque | None = None
     error: TorqueError | None = None
 
@@ -196,6 +198,7 @@ def read_motions(
                     tracked_twist=in_body(derivative(pose, rate), pose[:, 2])[keep].copy(),
                     shaking=shaking.speed[keep].copy(),
                     shaking_frequency=shaking.frequency,
+                    swing=shaking.swing[keep].copy(),
                 )
             )
     return motions

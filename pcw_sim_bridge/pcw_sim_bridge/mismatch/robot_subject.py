@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,12 @@ from .even_stamps import EvenStamps
 from .findings import InputFinding
 from .found_effect import effect_instance
 from .joint_glitches import without_glitches
+from .joint_ripples import JointRipple, joint_ripples
 from .long_recordings import part_of
 from .off_ground import wheels_off_ground, wheels_turn_alone
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .reported_torques import doubtful_reports, told_of
+from .ripple_sizes import RippleScale, RippleSize
 from .robot_channels import RobotProblemBuilder
 from .robot_motion import base_pose, choose_cutoff
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
@@ -54,6 +57,7 @@ from .wheel_agreement import contradictions
 OFF_GROUND = "joint_states: the wheels turn and the robot stands: they are off the ground, and each joint is judged by itself"
 UNBALANCED = 0.15  # of the force that torques make, which a steering that is turned far leaves at least
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
+WEIGHED = 0.3  # of the mean square that a ripple makes, which may be left beside it
 
 
 class RobotSubject:
@@ -63,6 +67,7 @@ class RobotSubject:
         self.robot = robot
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
+        self._choosing = threading.Lock()
         self._undescribed = Undescribed()
         self._missing: tuple[str, ...] = ()
         self._sensors: tuple[Path, tuple[bool, bool]] | None = None
@@ -188,6 +193,39 @@ class RobotSubject:
             return None
         return self._builder(opened).turned_steering(problem.limited)
 
+    def ripples(self, opened: Sequence[Opened]) -> Sequence[RippleSize]:
+        """Return ripples of joints that pass too fast for the channels, with their sizes.
+
+        None of robots that cannot be simulated, nor without torques.
+        """
+        recordings = [o.recording for o in opened]
+        if not self._can_be_simulated(recordings):
+            return ()
+        found = joint_ripples(self._seen_robot(), recordings, self._band(opened))
+        sizes = [self._ripple_scale(ripple, recordings).size() for ripple in found]
+        return [size for size in sizes if size is not None and size.after.mean() < WEIGHED * size.before.mean()]
+
+    def with_ripples(self, sizes: Sequence[RippleSize], opened: Sequence[Opened]) -> Sequence[RippleSize | None]:
+        """Return what ripples of such sizes leave of other recordings, None where these do not show them."""
+        recordings = [o.recording for o in opened]
+        if not recordings or not self._can_be_simulated(recordings):
+            return [None] * len(sizes)
+        return [self._ripple_scale(size.ripple, recordings).again(size) for size in sizes]
+
+    def _ripple_scale(self, ripple: JointRipple, recordings: Sequence[Recording]) -> RippleScale:
+        retuned = functools.partial(retuned_robot, self._seen_robot())
+        return RippleScale(retuned, recordings, ripple, self.band(), self._off_ground)
+
+    def band(self) -> float:
+        """Return the frequency that the channels of the first problem end at [Hz]."""
+        return self._cutoff if self._cutoff is not None else math.inf
+
+    def describing(self, effects: Sequence[EffectInstance]) -> RobotSubject:
+        """Return the robot with effects in its description, for the same recordings."""
+        subject = copy.copy(self)
+        subject.robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
+        return subject
+
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes it of the candidates of some keys alone."""
         builder = self._builder(opened)
@@ -195,13 +233,18 @@ class RobotSubject:
 
     def _builder(self, opened: Sequence[Opened]) -> RobotProblemBuilder:
         recordings, robot = [o.recording for o in opened], self._seen_robot()
-        if self._cutoff is None:
-            self._cutoff = choose_cutoff(robot, recordings, self._off_ground)
         try:
-            return RobotProblemBuilder(robot, recordings, self._cutoff, lifted=self._off_ground)
+            return RobotProblemBuilder(robot, recordings, self._band(opened), lifted=self._off_ground)
         except MismatchError as error:
             told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
             raise MismatchError("; ".join((str(error), *told))) from None
+
+    def _band(self, opened: Sequence[Opened]) -> float:
+        """Frequency that the channels end at [Hz], chosen by the first recordings."""
+        with self._choosing:
+            if self._cutoff is None:
+                self._cutoff = choose_cutoff(self._seen_robot(), [o.recording for o in opened], self._off_ground)
+            return self._cutoff
 
     def command_problems(self, opened: Sequence[Opened], searched: bool = True) -> Sequence[RegressionProblem]:
         """Return one problem per joint whose torque commands and torques were recorded."""
@@ -269,10 +312,12 @@ class RobotSubject:
     def windows(self, opened: Sequence[Opened]) -> Windows | None:
         """Return the windows to simulate; None without torques, or for a robot that cannot be driven by them."""
         recordings = [o.recording for o in opened]
+        return robot_windows(self.robot, recordings, self._off_ground) if self._can_be_simulated(recordings) else None
+
+    def _can_be_simulated(self, recordings: Sequence[Recording]) -> bool:
+        """Whether the reduced plant can be driven by the torques of recordings."""
         without_offset = bool(np.any(np.abs(self.robot.caster_offset[:, 0]) < 1e-3))
-        if without_offset or self.robot.fixed_wheels or not all(map(_has_effort, recordings)):
-            return None
-        return robot_windows(self.robot, recordings, self._off_ground)
+        return not (without_offset or self.robot.fixed_wheels or self._missing) and all(map(_has_effort, recordings))
 
     def rollout(self, windows: Windows) -> FloatArray:
         """Return the squared errors of the reduced plant under the measured torques, (W, H, S)."""

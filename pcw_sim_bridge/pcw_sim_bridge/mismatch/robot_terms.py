@@ -236,8 +236,20 @@ class _TermMaker:
         if (i, axis) not in self._of_joint:
             response = self.differences.of_unit_torque(i, axis)
             held, _ = self.looked.held_against(response[:, :, None])
-            self._of_joint[i, axis] = orders(held[:, 0], self.looked.angle[:, i, axis], self.looked.rate)
+            chosen = orders(held[:, 0], self.looked.angle[:, i, axis], self.looked.rate)
+            # A ripple that the description holds may be larger or smaller.
+            described = self._described_orders(i, axis)
+            self._of_joint[i, axis] = dataclasses.replace(chosen, values=np.concatenate([described, chosen.values]))
         return self._of_joint[i, axis]
+
+    def _described_orders(self, i: int, axis: int) -> FloatArray:
+        """Orders of the ripples that the description holds at one joint."""
+        own = self.robot.caster_names[i], AXIS_NAMES[axis]
+        return np.array([
+            instance.parameters["order"] for instance in self.robot.physics
+            if "order" in instance.parameters and own[0] in instance.target
+            and (instance.axis or all_effects()[instance.name].axis) == own[1]
+        ])  # fmt: skip
 
     # -- everything else ----------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from pcw_description.effect_instance import EffectInstance
 
 from .findings import InputFinding
 from .regression_problem import FloatArray, RegressionProblem
+from .ripple_sizes import RippleSize
 from .rollout import Windows
 from .turned_steering import TurnedSteering
 
@@ -52,6 +53,18 @@ class Subject(Protocol):
 
     def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> TurnedSteering | None:
         """Return the one cause beside which nothing can be judged, see `turned_steering`; None where there is none."""
+
+    def ripples(self, opened: Sequence[Opened]) -> Sequence[RippleSize]:
+        """Return ripples of joints that pass too fast for the channels, with their sizes."""
+
+    def with_ripples(self, sizes: Sequence[RippleSize], opened: Sequence[Opened]) -> Sequence[RippleSize | None]:
+        """Return what ripples of such sizes leave of other recordings, None where these do not show them."""
+
+    def band(self) -> float:
+        """Return the frequency that the channels of a problem end at [Hz]."""
+
+    def describing(self, effects: Sequence[EffectInstance]) -> Subject:
+        """Return the subject with effects in its description, for the same recordings."""
 
     def problem_with(self, opened: Sequence[Opened]) -> Callable[[Collection[str]], RegressionProblem]:
         """Return what makes the same of the candidates of some keys alone, none of which is made before."""

@@ -5,6 +5,9 @@ recording looks quiet and follows no model. The noise of an encoder looks the sa
 torque in the torques; what shakes a wheel is in both. So the speed is taken that the angles or the drive's own speeds show, or
 that the torques give the rotors and wheels by themselves, whichever is less. A torque that changes its sign with every sample
 brings the wheel back to where it was: its angles hardly show that, its speeds do.
+
+Casters that roll freely swing about their steering axes by themselves, too, as those of a trolley do (shimmy). No torque is in
+that, and it brings a robot to a stop. Angles alone say so, where they swing by far more than the noise of their encoders.
 """
 
 from __future__ import annotations
@@ -17,9 +20,12 @@ from scipy import signal
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 
 from .regression_problem import FloatArray
-from .signal_filter import SignalFilter
+from .signal_filter import SignalFilter, white_noise_level
 
 SPECTRUM_SAMPLES = 512
+# Angles alone are believed up to so many times the frequency that is filtered away, and where they swing by a power that is so
+# many times that of their noise.
+BELIEVED, BEYOND_NOISE = 4.0, 9.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,10 +35,12 @@ class Shaking:
     Attributes:
         speed: amplitude of the contact that shakes most (T,) [m/s].
         frequency: of the joint that shakes most [Hz]; 0 where none does.
+        swing: amplitude of the steering that swings most (T,) [rad], 0 where noise may do the same.
     """
 
     speed: FloatArray
     frequency: float
+    swing: FloatArray
 
 
 def wheel_shaking(
@@ -47,8 +55,11 @@ def wheel_shaking(
         low_pass: what is faster than it lets pass is looked at, amplitudes over its period.
     """
     rate, count = low_pass.rate, len(position)
-    if not np.isfinite(torque).all() or low_pass.cutoff >= 0.45 * rate:
-        return Shaking(np.zeros(count), 0.0)
+    if low_pass.cutoff >= 0.45 * rate:
+        return Shaking(np.zeros(count), 0.0, np.zeros(count))
+    swing = _swing(position[:, :, STEER], low_pass)
+    if not np.isfinite(torque).all():
+        return Shaking(np.zeros(count), 0.0, swing)
     inertia = np.array([[c.rotors.drive + c.wheel.inertia_axle, c.rotors.steer + c.module.inertia_zz] for c in robot.casters])
     reach = np.stack([robot.wheel_radius, np.linalg.norm(robot.caster_offset, axis=1)], axis=1)
 
@@ -65,4 +76,15 @@ def wheel_shaking(
     worst = int(np.argmax(np.mean(contact**2, axis=0)))
     seen = (by_speed if np.sum(own) > np.sum(angle) else by_angle).reshape(count, -1)[:, worst]
     frequencies, density = signal.welch(seen, rate, nperseg=min(SPECTRUM_SAMPLES, count))
-    return Shaking(speed, float(frequencies[int(np.argmax(density))]))
+    return Shaking(speed, float(frequencies[int(np.argmax(density))]), swing)
+
+
+def _swing(angle: FloatArray, low_pass: SignalFilter) -> FloatArray:
+    """Amplitude (T,) by which the one of some angles (T, n) that does so most swings faster than what is let pass."""
+    rate, lowest = low_pass.rate, low_pass.cutoff
+    highest = min(BELIEVED * lowest, 0.45 * rate)
+    within = SignalFilter(rate, highest).smooth(angle) - low_pass.smooth(angle)
+    power = np.maximum(low_pass.smooth(within**2), 0.0)
+    # The part of white noise that is in such a band.
+    noise = np.array([white_noise_level(column) for column in angle.T]) ** 2 * 2.0 * (highest - lowest) / rate
+    return np.asarray(np.sqrt(2.0 * np.where(power > BEYOND_NOISE * noise, power, 0.0)).max(axis=1))
