@@ -63,6 +63,10 @@ LEAST_EVIDENCE = 18.0  # [nats]
 STRENGTHS = (1.1, 20.0)
 LARGEST_STRENGTH = 30.0
 SHARE_OF_TWO_RECORDINGS = 0.25
+# Tyres softer along, in a description in which all are softer, are stiffer across: that would be another answer, and as right.
+NOT_HIDDEN_BY: Mapping[str, tuple[str, ...]] = {
+    "tyre_longitudinal_stiffness": ("contact.stiffness",), "tyre_lateral_stiffness": ("contact.stiffness",),
+}  # fmt: skip
 # What somebody tunes to make the effect go away stays so near to the description, in standard deviations.
 RETUNED_WITHIN = 2.0
 NOISE_RANGE = (0.5, 2.5)
@@ -282,7 +286,7 @@ class _Drawing:
             group = self._cancelling(name, scene, place) if cancelling else _alone(draw_effect(name, scene, place))
             instances, size = self._sized(group, run, channels)
             if self._order.masking == "retuned":
-                self._retune(size, channels)
+                self._retune(size, channels, name)
                 runs = [simulate(self._world.quiet(), run, instances)]
                 left = channels.evidence(self._world.nominal, runs, instances)
                 size = dataclasses.replace(size, evidence=left)
@@ -326,11 +330,11 @@ class _Drawing:
             raise MismatchError(f"{self._order.name}: {self._order.effects} at no size that the robot can be driven with")
         return measured[factor]
 
-    def _retune(self, size: EffectSize, channels: HealthyChannels) -> None:
+    def _retune(self, size: EffectSize, channels: HealthyChannels, effect: str) -> None:
         """Move the numbers of the description to where they hide the effect best; the controller believes them too."""
         nominal = {nuisance.name: nuisance.nominal for nuisance in channels.problem.nuisances}
         for number in healthy_numbers(self._base):
-            if number.described and number.name in size.retuned:
+            if number.described and number.name in size.retuned and number.name not in NOT_HIDDEN_BY.get(effect, ()):
                 relative = nominal[number.name] if number.name.startswith("rotors") else 1.0
                 widest = RETUNED_WITHIN * number.deviation
                 self._retuned[number.name] = float(np.clip(size.retuned[number.name] / relative, -widest, widest))
