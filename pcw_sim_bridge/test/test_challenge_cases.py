@@ -404,7 +404,7 @@ def test_some_healthy_robots_do_one_plain_manoeuvre_by_their_own_loops() -> None
 
 
 def test_one_way_of_tyres_is_not_hidden_by_making_another_effect_of_it() -> None:
-    """In a description in which all tyres are seven times stiffer, tyres softer along are right, and those across too stiff."""
+    """In a description in which all tyres are seven times stiffer, tyres softer along are right, and those across are not."""
     orders = order_cases(16, 2, kinds=("masked",), plants=("reduced",), durations=(15.0, 16.0))
     order = dataclasses.replace(next(o for o in orders if o.masking == "retuned"), effects=("tyre_lateral_stiffness",))
     retuned = prepare_case(order)["retuned"]
