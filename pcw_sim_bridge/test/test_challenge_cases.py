@@ -197,6 +197,19 @@ def test_size_is_in_proportion_and_nothing_is_no_size(channels: HealthyChannels)
     assert low < 0.0 < high
 
 
+def test_another_motion_is_no_size_of_an_effect(channels: HealthyChannels) -> None:
+    """Of a gain uneven by 0.02 % a run on PyBullet had 27 noise floors, all of them of wheels that slipped otherwise."""
+    tiny = EffectInstance("uneven_gain", THESIS.caster_names, {"size": 1e-4}, None)
+    # What slips otherwise, and in the same run nothing else.
+    other = effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": 0.06})
+    runs = [simulate(world().quiet(), RUN, [tiny, other])]
+    assert channels.size(runs, [tiny]).size < 0.1
+    assert channels.size(runs, [other]).size == pytest.approx(channels.size(runs, [tiny, other]).size, rel=0.01)
+    assert channels.size(runs).size > 3.0
+    seen = EffectInstance("uneven_gain", THESIS.caster_names, {"size": 0.1}, None)
+    assert channels.size([simulate(world().quiet(), RUN, [seen])], [seen]).size > 3.0
+
+
 def test_what_the_description_with_the_effect_does_not_explain_is_no_evidence(channels: HealthyChannels) -> None:
     """Two runs differ also in where the model is wrong: only what goes with the effect in the description counts."""
     effect = effect_instance("drive_coulomb_friction", ("rear_left",), {"coulomb": 0.02})

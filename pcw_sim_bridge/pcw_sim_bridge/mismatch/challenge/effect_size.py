@@ -1,10 +1,14 @@
-"""How large an effect is in the channels of the analyser: the same run, without noise in its sensors, with it and without.
+"""How large an effect is in the channels of the analyser: in a run with it, without noise in its sensors.
 
-    size = max over channels of rms(residual with - residual without) / noise floor
+    size = max over channels of rms(residual - residual by a description that holds it) / noise floor
 
-The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. An effect may be large
-and yet be no more than re-tuning within tolerances explains; `evidence` says what the run costs more with the effect than
-without it, and than the same run against a description that holds the effect [nats], each re-tuned by itself:
+The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. Both residuals are of
+one run. A run without the effect is another motion as soon as wheels slip a little otherwise, and of two motions all that is
+within tolerances is different, too: an effect a thousand times too small to be seen was 27 floors large. Only what no
+description holds (actuators and gears; torques by other joints or by time) is held against the same run without it.
+
+An effect may be large and yet be no more than re-tuning within tolerances explains. `evidence` says what the run costs more
+with the effect than without it, and than the same run against a description that holds it [nats], each re-tuned by itself:
 
     cost = min over nu of ( sum rho(W (residual - N nu)) + 1/2 |nu / tolerance|^2 ),
 
@@ -31,7 +35,7 @@ from ..noise_model import fit_noise_model, huber_weights
 from ..regression_problem import BoolArray, FloatArray, RegressionProblem
 from ..robot_channels import RobotProblemBuilder
 from .healthy_deviations import tolerated_cost
-from .simulated_case import SimulatedRecording
+from .simulated_case import SimulatedRecording, known_while_simulated
 
 EXACT_ROUNDS = 8  # of re-tuning, each exact where the one before came out
 STEPS = (1.0, 0.5, 0.2, 0.05)  # parts of the way that are tried
@@ -101,18 +105,18 @@ class HealthyChannels:
             if apart > TURNED_OTHERWISE:
                 raise MismatchError(f"headings apart by {apart:.3g} rad; allowed: {TURNED_OTHERWISE:g} rad, the same motion")
         with_effect = _build(self._nominal, recordings, self._cutoff)
-        change = self._change(with_effect)
-        rows = problem.valid & np.isfinite(change)
+        holding = self._holding(self._nominal, recordings, effects)
+        along, change, rows = self._change(with_effect, holding)
         relative = _rms(change, rows) / self.floor
         largest = int(np.argmax(relative))
-        (cost, moved), described = self._costs(self._nominal, with_effect, recordings, effects)
+        (cost, moved), described = self._costs(with_effect, holding)
         _, healthy_moved = self._healthy_cost
         active = np.any(rows & (np.abs(change) > self.floor), axis=1)
         return EffectSize(
             size=float(relative[largest]),
             channel=problem.channels[largest].name,
             evidence=_evidence(self._nominal, cost - described, effects),
-            region=_regions(problem, active),
+            region=_regions(along, active),
             retuned={n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)},
         )
 
@@ -120,12 +124,21 @@ class HealthyChannels:
         self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance] = ()
     ) -> float:
         """The evidence of effects in these runs against another description [nats], see above."""
-        (cost, _), described = self._costs(nominal, _build(nominal, recordings, self._cutoff), recordings, effects)
+        holding = self._holding(nominal, recordings, effects)
+        (cost, _), described = self._costs(_build(nominal, recordings, self._cutoff), holding)
         return _evidence(nominal, cost - described, effects)
 
+    def _holding(
+        self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance]
+    ) -> RegressionProblem | None:
+        """The same runs against a description that holds the effects; None where none can."""
+        with known_while_simulated(effects):
+            if not effects or not all(_in_channels(instance) for instance in effects):
+                return None
+            return _build(dataclasses.replace(nominal, physics=(*nominal.physics, *effects)), recordings, self._cutoff)
+
     def _costs(
-        self, nominal: RobotDescription, problem: RegressionProblem, recordings: Sequence[SimulatedRecording],
-        effects: Sequence[EffectInstance],
+        self, problem: RegressionProblem, holding: RegressionProblem | None
     ) -> tuple[tuple[float, FloatArray], float]:
         """Cost and re-tuning of runs with effects, and what no description explains of them.
 
@@ -133,19 +146,22 @@ class HealthyChannels:
         judged hangs on the description, too: those that only one of them judges are no evidence.
         """
         healthy, _ = self._healthy_cost
-        if not effects or not all(_in_channels(instance) for instance in effects):
+        if holding is None:
             return self._cost(problem), healthy
-        holding = _build(dataclasses.replace(nominal, physics=(*nominal.physics, *effects)), recordings, self._cutoff)
         both = problem.valid & holding.valid
         described, _ = self._cost(dataclasses.replace(holding, valid=both))
         return self._cost(dataclasses.replace(problem, valid=both)), max(healthy, described)
 
-    def _change(self, other: RegressionProblem) -> FloatArray:
-        """What the residual of another run is more than that of the quiet one (T, C)."""
+    def _change(
+        self, other: RegressionProblem, holding: RegressionProblem | None
+    ) -> tuple[RegressionProblem, FloatArray, BoolArray]:
+        """What the effect does to the residual (T, C), where that can be judged, and the run along which it does so."""
+        if holding is not None:
+            return other, other.residual - holding.residual, other.valid & holding.valid
         length = min(len(self.problem.residual), len(other.residual), len(self._quiet.residual))
         change = np.zeros_like(self.problem.residual)
         change[:length] = other.residual[:length] - self._quiet.residual[:length]
-        return change
+        return self.problem, change, self.problem.valid & np.isfinite(change)
 
     def _cost(self, problem: RegressionProblem) -> tuple[float, FloatArray]:
         """Least cost of a run, see above, reached or promised by first orders, and the re-tuning (K,) that reaches least.
@@ -225,7 +241,8 @@ def _evidence(robot: RobotDescription, costs_more: float, effects: Sequence[Effe
 def _in_channels(instance: EffectInstance) -> bool:
     """Whether the channels of a description that holds the effect are exact.
 
-    What comes before the measured torque is not in them; gears that play or give are, to first order; laws are in no library.
+    What comes before the measured torque is not in them; gears that play or give are, to first order; torques by other joints
+    or by time are in no description.
     """
     effect = all_effects().get(instance.name)
     return effect is not None and not isinstance(effect, ActuatorEffect | TransmissionEffect)

@@ -115,7 +115,7 @@ def simulate(world: World, run: Run, effects: Sequence[EffectInstance]) -> Simul
     Raises:
         PlantError: the plant leaves what it can compute.
     """
-    with _known(effects):
+    with known_while_simulated(effects):
         robot = world.with_effects(effects)
         simulated = SimulatedRobot(world.make(robot, effects), run.seed)
         excitation = make_excitation(run.excitation, world.nominal, run.duration, run.seed)
@@ -135,7 +135,7 @@ def record(
     Raises:
         PcwError: as `record_run`.
     """
-    with _known(effects):
+    with known_while_simulated(effects):
         robot = world.with_effects(effects)
         excitation = make_excitation(run.excitation, world.nominal, run.duration, run.seed)
         record_run(
@@ -148,7 +148,7 @@ def _outside(instance: EffectInstance) -> Effect | None:
     return OUTSIDE_EFFECTS[instance.name].effect if instance.name in OUTSIDE_EFFECTS else None
 
 
-def _known(effects: Sequence[EffectInstance]):  # type: ignore[no-untyped-def]
+def known_while_simulated(effects: Sequence[EffectInstance]):  # type: ignore[no-untyped-def]
     """The effects from outside the library are in the vocabulary while, and only while, they are simulated."""
     found = [effect for e in effects if (effect := _outside(e)) is not None]
     return also_known([effect for effect in found if not isinstance(effect, CrossJointLaw)])
