@@ -108,7 +108,9 @@ def test_a_motor_that_cogs_at_speed(tmp_path: Path, controller: str) -> None:
 def test_what_the_channels_see_of_a_ripple_corrects_its_size(tmp_path: Path) -> None:
     """A motor that also turns slowly: one effect, and not a second one of what the first was off by."""
     path = recorded(tmp_path / "run", "flow_base", "random_goals", COGGING, "--controller", "computed_torque")
-    [named] = analysed(path, "flow_base").findings.effects
+    findings = analysed(path, "flow_base").findings
+    [named] = findings.effects
     assert (named.name, named.target) == ("motor_cogging", ("rear_left",))
+    assert [place.casters for place in findings.locations] == [("rear_left",)]
     size = math.hypot(named.parameters["cosine"].value, named.parameters["sine"].value)
     assert size == pytest.approx(0.5, rel=0.1)

@@ -144,7 +144,8 @@ def analyse(
             f"only {usable:.1f} s of usable motion (moving, no gross slip), {100 * judged.mean():.0f} % of what was recorded; "
             f"at least {LEAST_DURATION:g} s are needed, and {100 * LEAST_UNDISTURBED:.0f} % where wheels shake"
         )
-        notes = (note, *lengths, *problem.remarks, *ripples.notes)
+        rippling = [plain.statement(instance) for _, instance in ripples.named]
+        notes = (note, *lengths, *problem.remarks, *ripples.notes, *rippling)
         empty = Findings(
             subject.name, "insufficient_data", inputs, (), (), (), (), (), None, (), (), notes, time.monotonic() - begun
         )
@@ -168,8 +169,9 @@ def analyse(
     pairs, gaping = doubted_in_a_gap(
         [(named, named.effect) for named in explanation.named], 0.0 if proof.untuned else proof.finding.gap_closed
     )
-    everything, crowded = doubted_in_a_crowd([*with_ripples(pairs, ripples.named), *commands.named])
-    commands = commands.and_also(ripples)
+    pairs, ripples = with_ripples(pairs, ripples)
+    everything, crowded = doubted_in_a_crowd([*pairs, *commands.named])
+    commands = ripples.and_also(commands)
     instances = [instance for _, instance in everything]
     retuned = _retuned(problem, explanation.fit)
     numbers = {name: value for name, value in _reported_numbers(explanation).items() if name not in proof.untuned}

@@ -52,25 +52,27 @@ def ripple_findings(
 
 
 def with_ripples(
-    named: Sequence[tuple[NamedTerm, EffectInstance]], ripples: Sequence[tuple[NamedTerm, EffectInstance]]
-) -> list[tuple[NamedTerm, EffectInstance]]:
-    """Return all effects, those that the channels say of a ripple added to what is known of it already.
+    named: Sequence[tuple[NamedTerm, EffectInstance]], ripples: CommandFindings
+) -> tuple[list[tuple[NamedTerm, EffectInstance]], CommandFindings]:
+    """Return all effects, what the channels say of a ripple added to what is known of it; and the findings of the others.
 
     Where a joint turns slowly the channels weigh a ripple themselves, by what they find beside its first size.
     """
-    found, rest = [], list(ripples)
+    found, rest = [], list(zip(ripples.named, ripples.locations, strict=True))
     for entry, instance in named:
-        ripple = next((other for other in rest if _same(entry, other[0])), None)
+        ripple = next((other for other in rest if _same(entry, other[0][0])), None)
         if ripple is None:
             found.append((entry, instance))
             continue
         rest.remove(ripple)
+        first = ripple[0][0].estimates
         both = {
-            name: _plus(estimate, ripple[0].estimates[name].value) if name != "order" else ripple[0].estimates[name]
+            name: _plus(estimate, first[name].value) if name != "order" else first[name]
             for name, estimate in entry.estimates.items()
         }
         found.append(with_instance(dataclasses.replace(entry, estimates=both, probability=SURE, ambiguous_with=())))
-    return [*found, *rest]
+    alone, places = [effect for effect, _ in rest], tuple(place for _, place in rest)
+    return [*found, *alone], dataclasses.replace(ripples, named=tuple(alone), locations=places)
 
 
 def beside_ripples(explanation: Explanation, ripples: CommandFindings) -> tuple[Explanation, tuple[str, ...]]:

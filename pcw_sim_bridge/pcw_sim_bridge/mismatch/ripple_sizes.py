@@ -106,21 +106,18 @@ class RippleScale:
     """Weighs one ripple in windows of recordings."""
 
     def __init__(
-        self, retuned: Retuned, recordings: Sequence[Recording], ripple: JointRipple, lowest: float, lifted: bool = False
+        self, retuned: Retuned, recordings: Sequence[Recording], ripple: JointRipple, lowest: float
     ) -> None:
-        """Take a robot without the ripple, recordings with torques, and the frequency above which it was looked for [Hz].
-
-        Args:
-            lifted: whether the wheels are off the ground.
-        """
+        """Take a robot without the ripple, recordings with torques, and the frequency above which it was looked for [Hz]."""
         robot = retuned({})
-        self.retuned, self.ripple, self.lifted = retuned, ripple, lifted
+        self.retuned, self.ripple = retuned, ripple
         self.index = i, k = robot.caster_index(ripple.caster), AXIS_NAMES.index(ripple.axis)
         found = [_windows(r, n, self.index, ripple, lowest, len(recordings)) for n, r in enumerate(recordings)]
         self.windows = [windows for windows in found if windows is not None]
-        rotor = float(rotor_armature(robot, k)[0, k, k])
-        tyre = {"contact.stiffness": 1.0, "contact.relaxation_length": common_relaxation(robot)}
-        described = {**({} if lifted else tyre), f"rotors.{ripple.axis}": rotor}
+        described = {
+            "contact.stiffness": 1.0, "contact.relaxation_length": common_relaxation(robot),
+            f"rotors.{ripple.axis}": float(rotor_armature(robot, k)[0, k, k]),
+        }  # fmt: skip
         known = [(name, nominal, _deviation(robot, name, nominal)) for name, nominal in described.items()]
         self.varied = [number for number in known if number[2] > 0.0]
         self.probe = PROBE * float(robot.torque_limit[i, k])
@@ -208,11 +205,9 @@ class RippleScale:
         substeps = math.ceil(windows.step / STEP - 1e-6)
         # The torques were measured behind whatever happens to the commands.
         behind = tuple(instance for instance in robot.physics if not isinstance(get(instance.name), ActuatorEffect))
-        plant = ReducedPlant(dataclasses.replace(robot, physics=behind), windows.step / substeps, self.lifted)
+        plant = ReducedPlant(dataclasses.replace(robot, physics=behind), windows.step / substeps)
         angle, rate = windows.angle[:, :1], windows.rate[:, :1]
-        twist = np.zeros((len(angle), 1, 3))
-        if not self.lifted:
-            twist = wheel_twist(ModelNumbers.of(as_it_really_is(robot)), angle[..., STEER], rate)
+        twist = wheel_twist(ModelNumbers.of(as_it_really_is(robot)), angle[..., STEER], rate)
         starts = WindowStarts(
             np.zeros(1, dtype=np.int64), windows.begin, np.zeros((len(angle), 1, 3)), twist, angle, rate, np.zeros_like(angle)
         )

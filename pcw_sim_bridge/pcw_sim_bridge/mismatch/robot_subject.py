@@ -196,10 +196,10 @@ class RobotSubject:
     def ripples(self, opened: Sequence[Opened]) -> Sequence[RippleSize]:
         """Return ripples of joints that pass too fast for the channels, with their sizes.
 
-        None of robots that cannot be simulated, nor without torques.
+        None of robots that cannot be simulated, nor without torques; off the ground joints are judged one by one.
         """
         recordings = [o.recording for o in opened]
-        if not self._can_be_simulated(recordings):
+        if self._off_ground or not self._can_be_simulated(recordings):
             return ()
         found = joint_ripples(self._seen_robot(), recordings, self._band(opened))
         sizes = [self._ripple_scale(ripple, recordings).size() for ripple in found]
@@ -214,7 +214,7 @@ class RobotSubject:
 
     def _ripple_scale(self, ripple: JointRipple, recordings: Sequence[Recording]) -> RippleScale:
         retuned = functools.partial(retuned_robot, self._seen_robot())
-        return RippleScale(retuned, recordings, ripple, self.band(), self._off_ground)
+        return RippleScale(retuned, recordings, ripple, self.band())
 
     def band(self) -> float:
         """Return the frequency that the channels of the first problem end at [Hz]."""
