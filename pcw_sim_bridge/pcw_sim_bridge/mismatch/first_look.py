@@ -17,6 +17,7 @@ from scipy import signal as filters
 
 from pcw_description.compiled import compiled
 
+from .angle_spectrum import angle_spectrum
 from .noise_model import robust_deviation
 from .regression_problem import BoolArray, FloatArray, IntArray, Nuisance
 
@@ -24,7 +25,6 @@ LARGEST_ORDER = 400.0
 MOST_ORDERS = 4
 # A ripple may show in this part of the samples alone, those in which the joint turns slowly.
 SLOW_PART = 0.1
-SAMPLES_PER_WAVE = 8.0
 # Of a joint that turns by so much [rad], and by no whole turn, ripples are known by so many of their waves.
 LEAST_TURN, LEAST_WAVES = 1.5, 3.0
 # Pushes last so long [s]; patches of floor measure so much [m], on a grid of such cells.
@@ -117,15 +117,7 @@ def orders(signal: FloatArray, angle: FloatArray, rate: float) -> Chosen:
         return Chosen(np.zeros(0), 1)
     least = 0.5 if span >= math.tau else LEAST_WAVES * math.tau / span
     largest = min(math.pi * rate / max(speed, 1e-9), LARGEST_ORDER)
-    # A signal over evenly spaced angles has its orders by one transform; each sample is shared by the two next to it.
-    density = SAMPLES_PER_WAVE * largest / math.tau
-    place = (angle - angle.min()) * density
-    before = place.astype(np.int64)
-    count = int(before.max()) + 2
-    part = place - before
-    along = np.bincount(before, (1.0 - part) * signal, count) + np.bincount(before + 1, part * signal, count)
-    power = np.abs(np.fft.rfft(along, 4 * count)) ** 2
-    tried = math.tau * density / (4 * count) * np.arange(len(power))
+    tried, power = angle_spectrum(signal, angle, largest)
     wanted = (tried >= max(tried[1], least)) & (tried < largest)
     tried, power = tried[wanted], power[wanted]
     if not len(tried):

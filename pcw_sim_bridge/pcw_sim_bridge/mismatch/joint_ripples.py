@@ -22,6 +22,7 @@ from scipy import signal
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
+from .angle_spectrum import angle_spectrum
 from .even_stamps import PAUSE
 from .regression_problem import BoolArray, FloatArray
 
@@ -147,18 +148,6 @@ def _bands(robot: RobotDescription, recording: Recording, lowest: float) -> list
     return found
 
 
-def spectrum(values: FloatArray, angle: FloatArray, largest: float) -> tuple[FloatArray, FloatArray]:
-    """Return orders (K,) up to the largest one [1/rad], and the power (K,) of a signal (T,) over an angle (T,) at them."""
-    density = 4.0 * largest / math.tau
-    place = (angle - angle.min()) * density
-    before = place.astype(np.int64)
-    count, part = int(before.max()) + 2, place - before
-    along = np.bincount(before, (1.0 - part) * values, count) + np.bincount(before + 1, part * values, count)
-    power = np.asarray(np.abs(np.fft.rfft(along, 2 * count)) ** 2, dtype=np.float64)
-    orders = math.tau * density / (2 * count) * np.arange(len(power))
-    return np.asarray(orders, dtype=np.float64), power
-
-
 def _ripple(band: _Band) -> JointRipple | None:
     """The clearest ripple of a joint, or None."""
     top, usual = (float(np.quantile(band.speed, part)) for part in (0.95, 0.5))
@@ -166,7 +155,7 @@ def _ripple(band: _Band) -> JointRipple | None:
     largest = min(math.tau * band.highest / max(usual, 0.2), LARGEST_ORDER)
     if least >= largest or not band.values.any():
         return None
-    orders, power = spectrum(band.values, band.angle, largest)
+    orders, power = angle_spectrum(band.values, band.angle, largest)
     among = np.flatnonzero((orders >= least) & (orders < largest))
     if len(among) < 20:
         return None
