@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,6 +73,15 @@ def test_waves_under_all_wheels_are_those_of_the_floor() -> None:
     found = [ripple for one in rough if (ripple := _ripple(one)) is not None]
     assert len(found) == 4 and len(_apart(rough[:1], found[:1])) == 1
     assert _apart(rough, found) == []
+
+
+def test_a_recording_of_next_to_nothing_has_none() -> None:
+    robot = load_robot("tidybot2")
+    for count in (0, 1, 2, 5):
+        stamp = 0.01 * np.arange(count)
+        nothing = np.zeros((count, robot.n, 2))
+        joints = SimpleNamespace(stamp=stamp, position=nothing, velocity=nothing, effort=nothing)
+        assert joint_ripples(robot, [SimpleNamespace(joint_states=joints)], 3.0) == ()  # type: ignore[list-item]
 
 
 def test_healthy_robots_have_none(tmp_path: Path) -> None:

@@ -107,15 +107,15 @@ def even_series(recording: Recording) -> tuple[FloatArray, FloatArray, BoolArray
     there is no gap (T,).
     """
     joints = recording.joint_states
-    step = float(np.median(np.diff(joints.stamp)))
-    time = np.arange(joints.stamp[0], joints.stamp[-1], step)
+    step = float(np.median(np.diff(joints.stamp))) if len(joints.stamp) > 1 else 0.0
+    time = np.arange(joints.stamp[0], joints.stamp[-1], step) if step > 0.0 else np.zeros(0)
     values = np.full((len(time), *joints.position.shape[1:], 3), np.nan)
     for k, column in enumerate((joints.position, joints.velocity, joints.effort)):
         for i, axis in np.ndindex(*joints.position.shape[1:]):
             seen = np.isfinite(column[:, i, axis])
             if seen.mean() > 0.5:
                 values[:, i, axis, k] = np.interp(time, joints.stamp[seen], column[seen, i, axis])
-    after = np.minimum(np.searchsorted(joints.stamp, time), len(joints.stamp) - 1)
+    after = np.minimum(np.searchsorted(joints.stamp, time), max(len(joints.stamp) - 1, 0))
     gap = joints.stamp[after] - joints.stamp[np.maximum(after - 1, 0)]
     return time, values, np.asarray(gap < PAUSE)
 
