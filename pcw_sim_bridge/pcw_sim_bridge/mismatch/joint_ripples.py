@@ -113,7 +113,7 @@ def even_series(recording: Recording) -> tuple[FloatArray, FloatArray, BoolArray
     for k, column in enumerate((joints.position, joints.velocity, joints.effort)):
         for i, axis in np.ndindex(*joints.position.shape[1:]):
             seen = np.isfinite(column[:, i, axis])
-            if seen.mean() > 0.5:
+            if 2 * np.count_nonzero(seen) > len(seen):
                 values[:, i, axis, k] = np.interp(time, joints.stamp[seen], column[seen, i, axis])
     after = np.minimum(np.searchsorted(joints.stamp, time), max(len(joints.stamp) - 1, 0))
     gap = joints.stamp[after] - joints.stamp[np.maximum(after - 1, 0)]
