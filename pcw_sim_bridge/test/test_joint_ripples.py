@@ -12,6 +12,7 @@ from pcw_description import load_robot
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.joint_ripples import _apart, _Band, _ripple, joint_ripples
+from pcw_sim_bridge.mismatch.ripple_sizes import RippleScale
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 
@@ -113,6 +114,21 @@ def test_a_motor_that_cogs_at_speed(tmp_path: Path, controller: str) -> None:
     assert any("keeps step with the drive of rear_left, 12 periods per turn" in note for note in findings.notes)
     [patched] = [effect for effect in analysis.patched.mapping()["physics"] if effect["name"] == "motor_cogging"]
     assert (patched["axis"], patched["order"]) == ("drive", 12.0)
+
+
+def test_a_size_that_is_held_against_other_recordings_is_of_the_order_that_was_found(tmp_path: Path) -> None:
+    """No whole one: it is re-tuned beside the size, and would be a second time."""
+    robot = load_robot("tidybot2")
+    physics = COGGING.replace("12.0", "12.42")
+    path = recorded(tmp_path / "run", "tidybot2", "coast_down", physics, "--controller", "velocity_loops")
+    recording = Recording.open(path, robot)
+    [ripple] = joint_ripples(robot, [recording], 3.0)
+    assert ripple.order == pytest.approx(12.42, abs=ripple.width)
+    size = RippleScale(lambda numbers: robot, [recording], ripple, 3.0).size()
+    assert size is not None and size.ripple.order == pytest.approx(12.42, abs=0.1 * ripple.width)
+    again = RippleScale(lambda numbers: robot, [recording], size.ripple, 3.0).again(size)
+    assert again is not None and again.ripple.order == size.ripple.order
+    assert again.after.mean() == pytest.approx(size.after.mean(), rel=0.01)
 
 
 def test_what_the_channels_see_of_a_ripple_corrects_its_size(tmp_path: Path) -> None:

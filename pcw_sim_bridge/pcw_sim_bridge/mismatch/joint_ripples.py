@@ -30,8 +30,8 @@ LEAST_ORDER, LARGEST_ORDER = 1.5, 150.0  # [1/rad]
 HIGHEST = 60.0  # [Hz]; above it tyres and gears of most robots let nothing pass
 NYQUIST_PART = 0.4  # of the sampling rate that a band ends at
 LEAST_TURNS = 2.0
-# A line stands out from the orders within this part of its own by this factor; of 60 healthy or otherwise faulty recordings of
-# three plants none did by more than 90, and ripples of half a newton metre by ten thousand and more.
+# A line stands out from the orders within this part of its own by this factor. Without a ripple none did by more than 90, in
+# recordings of healthy and otherwise faulty robots on three plants; those of half a newton metre did by 400 to 100 000.
 NEIGHBOURS, STANDS_OUT = 0.2, 300.0
 PART = 0.05  # of all that the joint does in the band, at least
 # Taken in ten parts of the time it keeps in step, speeds differ, and it is more than any tone of one frequency.

@@ -56,7 +56,7 @@ class RippleSize:
 
     Attributes:
         ripple: the ripple; cosine, sine: of its torque [N m]; deviations: of both (2,) [N m].
-        numbers: what else was re-tuned, in deviations (J,).
+        numbers: what else was re-tuned, in deviations (J,): of the description, the order, and the instant of torques.
         before, after, floor: of the torques that would do what is left without it, with it, and of what noise of the encoder
             leaves, mean squares (W,) [N^2 m^2]: the part of each window, by how far it can be trusted, in the mean of all.
         recording, begin: number and stamp [s] of the windows (W,).
@@ -150,8 +150,11 @@ class RippleScale:
 
     def again(self, size: RippleSize) -> RippleSize | None:
         """What a size that others told leaves of these recordings; None where too few windows show the ripple."""
-        enough = sum(len(w.begin) for w in self.windows) >= LEAST_WINDOWS
-        return self._at(np.array([size.cosine, size.sine, *size.numbers]), size.deviations) if enough else None
+        if sum(len(w.begin) for w in self.windows) < LEAST_WINDOWS:
+            return None
+        point = np.array([size.cosine, size.sine, *size.numbers])
+        point[-2] = 0.0  # the order is the ripple's by now
+        return self._at(point, size.deviations)
 
     def _at(self, point: FloatArray, deviations: FloatArray) -> RippleSize:
         left, without = self._left(point), self._left(np.array([0.0, 0.0, *point[2:]]))
