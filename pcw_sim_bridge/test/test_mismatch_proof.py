@@ -608,6 +608,8 @@ def test_held_out_data_contradict_an_effect_of_which_hardly_a_part_is_there(part
     nats, work = held_out.help_of(0)
     assert work == pytest.approx(0.5 * weight, rel=0.05)
     assert (nats > 0.0) is speaks_for_it
+    # Than with nothing in its place: from half of it on.
+    assert held_out.is_smaller_with(0) is (part > 0.5)
 
 
 @pytest.mark.parametrize(
@@ -827,22 +829,25 @@ def test_nothing_missing_is_an_empty_patch_without_harm(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("help_and_work", "doubted", "refused"),
+    ("help_and_work", "smaller", "doubted", "refused"),
     [
-        ((-3.7, 7.0), False, False),  # what such data say for an effect that is there spreads by as much
-        ((-4.6, 7.0), False, True),
-        ((-0.1, 60.0), False, True),
-        ((-0.1, 60.0), True, False),  # as look-alikes are separated
-        ((-3.1, 60.0), True, True),
-        ((-9.0, 4.0), False, False),  # next to nothing of it is there
+        ((-3.7, 7.0), True, False, False),  # what such data say for an effect that is there spreads by as much
+        ((-3.7, 7.0), False, False, True),  # a patch that makes the error larger is none
+        ((-4.6, 7.0), True, False, True),
+        ((-0.1, 60.0), True, False, True),
+        ((-0.1, 60.0), False, True, False),  # as look-alikes are separated
+        ((-3.1, 60.0), True, True, True),
+        ((-9.0, 4.0), False, False, False),  # next to nothing of it is there
     ],
 )
 def test_held_out_data_that_hardly_hold_an_effect_do_not_refuse_it(
-    help_and_work: tuple[float, float], doubted: bool, refused: bool
+    help_and_work: tuple[float, float], smaller: bool, doubted: bool, refused: bool
 ) -> None:
     """A friction of 0.106 N m, right to a thousandth and by 150 nats, was refused by a recording that hardly had it."""
     instance = Instance(0, (), (0,))
     named = SimpleNamespace(instance=instance, probability=1.0, ambiguous_with=("another",) if doubted else ())
-    held_out = SimpleNamespace(proposed=(0,), instances=(instance,), help_of=lambda index: help_and_work)
+    held_out = SimpleNamespace(
+        proposed=(0,), instances=(instance,), help_of=lambda index: help_and_work, is_smaller_with=lambda index: smaller
+    )
     found = Prover._useless(SimpleNamespace(), SimpleNamespace(named=(named,)), held_out)  # type: ignore[arg-type]
     assert (found is not None) is refused

@@ -162,13 +162,21 @@ class HeldOut:
         if np.any(np.abs(alone[:, : self.nuisances]) > self._limits(both)):
             better = max(better, self._error(self._healthy_means(index, self._limits(both))) - self._error(both))
         rows = slice(*self.span(index))
-        idle = both.copy()
-        idle[:, rows] = 0.0
         work = 0.5 * float(sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True)))
-        smaller = self._error(idle) - self._error(both)
+        smaller = self._error(self._idle(index)) - self._error(both)
         # The error is a parabola of the part of the effect that is at work, and least at (1 + smaller / work) / 2 of it.
         contradicted = smaller < -CONTRADICTED and smaller < (2.0 * LEAST_PART - 1.0) * work
         return smaller if contradicted else better, work
+
+    def is_smaller_with(self, index: int) -> bool:
+        """Whether the error of held-out data is smaller with an effect than with nothing in its place, and than without it."""
+        return self._error(self.means()) < min(self._error(self._idle(index)), self._error(self.means(index)))
+
+    def _idle(self, index: int) -> FloatArray:
+        """Fitted numbers of every fold (F, k) with nothing in the place of an effect."""
+        idle = self.means()
+        idle[:, slice(*self.span(index))] = 0.0
+        return idle
 
     def _limits(self, means: FloatArray) -> FloatArray:
         """Changes (F, nuisances) up to which numbers of the description are those of a healthy robot, or as far as here."""

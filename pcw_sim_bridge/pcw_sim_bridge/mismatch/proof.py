@@ -331,8 +331,8 @@ class Prover:
     def _useless(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
         """The effect that adds most to the held-out error, if one adds to it.
 
-        Where an effect has little to do, data that hold it are often foretold no better with it. Against one that is said to
-        be ambiguous the held-out data have to speak as clearly as look-alikes are separated.
+        Where one that makes the error smaller has little to do, data that hold it are often foretold no better. Against one
+        that is said to be ambiguous the held-out data have to speak as clearly as look-alikes are separated.
         """
         doubted = {named.instance for named in explanation.named if named.ambiguous_with}
         believed = {named.instance: named.probability for named in explanation.named}
@@ -341,8 +341,10 @@ class Prover:
             if believed.get(held_out.instances[index], 1.0) < LEAST_PROBABILITY:
                 return index, "an effect that is not proposed explains by far more"
             nats, work = held_out.help_of(index)
-            # Noise spreads what data that hold it say for it, its work on average, by the root of twice that.
-            least = min(work - SHORT_OF * math.sqrt(2.0 * work), -AMBIGUOUS if held_out.instances[index] in doubted else 0.0)
+            least = -AMBIGUOUS if held_out.instances[index] in doubted else 0.0
+            if work > AT_WORK and nats <= least and held_out.is_smaller_with(index):
+                # Noise spreads what data that hold it say for it, its work on average, by the root of twice that.
+                least = min(work - SHORT_OF * math.sqrt(2.0 * work), least)
             if work > AT_WORK and nats <= least:
                 found.append((nats, index))
         return (min(found)[1], "the error is no smaller with it") if found else None

@@ -15,9 +15,10 @@ from .findings import ChannelFinding, ChannelProof, LocationFinding
 from .joint_ripples import JointRipple
 from .paired_errors import PairedErrors, blocks_of, interval
 from .regression_problem import FloatArray, Term
-from .ripple_sizes import EFFECT, RippleSize
+from .ripple_sizes import RippleSize
 from .whitened_regression import Instance
 
+EFFECT = "motor_cogging"
 # A wave that keeps step with a joint whatever its speed is the joint's; that it is one of its motor is what else it may be.
 SURE = 0.99
 

@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.kinds import ActuatorEffect
 from pcw_description.effects.registry import get
 from pcw_description.recording import Recording
@@ -25,7 +24,6 @@ from pcw_description.robot_description import AXIS_NAMES, STEER, RobotDescriptio
 
 from ..plants.reduced import ReducedPlant, WindowStarts
 from ..plants.true_robot import as_it_really_is
-from .found_effect import effect_instance
 from .joint_ripples import HIGHEST, JointRipple, even_series
 from .regression_problem import BoolArray, FloatArray, IntArray
 from .robot_nuisances import common_relaxation, rotor_armature
@@ -33,7 +31,6 @@ from .robot_rollout import STEP, wheel_twist
 from .rolling_model import ModelNumbers
 from .signal_filter import white_noise_level
 
-EFFECT = "motor_cogging"
 LENGTH, SETTLING = 0.5, 0.15  # [s], of a window, and of its beginning, in which tyres take up their forces
 WINDOWS, LEAST_WINDOWS = 48, 6  # at most, spread over all that was recorded, and at least
 DRIFT = 4  # numbers of the polynomial that is the drift of a window
@@ -72,12 +69,6 @@ class RippleSize:
     floor: FloatArray
     recording: IntArray
     begin: FloatArray
-
-    @property
-    def effect(self) -> EffectInstance:
-        """The effect, as it stands under `physics:`."""
-        values = {"cosine": self.cosine, "sine": self.sine, "order": self.ripple.order}
-        return effect_instance(EFFECT, (self.ripple.caster,), values, self.ripple.axis)
 
 
 @dataclasses.dataclass(frozen=True)
