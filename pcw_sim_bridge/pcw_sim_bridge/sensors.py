@@ -139,14 +139,19 @@ class Imu:
         ]
 
     def read(self, truth: PlantState, rng: np.random.Generator) -> ImuReading:
-        """Return one reading; the plants are planar in what they report, so roll and pitch are zero."""
+        """Return one reading. Of roll and pitch, which are small, no products are taken, and no bouncing on the springs."""
         imu = self._sensor
-        r_x, r_y, _ = imu.position
+        r_x, r_y, r_z = imu.position
         a_x, a_y, alpha = truth.acceleration
         omega = truth.twist[2]
+        rolling, pitching = truth.swing_acceleration
         # a_0 + alpha x r + omega x (omega x r), written out: np.cross is slow on single vectors.
-        acceleration = np.array([a_x - alpha * r_y - omega**2 * r_x, a_y + alpha * r_x - omega**2 * r_y, 0.0]) - truth.gravity
-        rate = np.array([0.0, 0.0, omega])
+        acceleration = np.array([
+            a_x - alpha * r_y - omega**2 * r_x + pitching * r_z,
+            a_y + alpha * r_x - omega**2 * r_y - rolling * r_z,
+            rolling * r_y - pitching * r_x,
+        ]) - truth.gravity  # fmt: skip
+        rate = np.array([*truth.swing_rate, omega])
         for effect, parameters in self._effects:
             rate, acceleration = effect.measure(rate, acceleration, parameters)
         return ImuReading(

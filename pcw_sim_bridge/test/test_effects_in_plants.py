@@ -581,7 +581,9 @@ def test_a_robot_rolls_down_a_slope(plant_name, direction):
     assert found == pytest.approx(expected, rel=0.01)
     assert states[-1].normal_force.sum() == pytest.approx(WEIGHT * math.cos(angle), rel=0.01)
     # Rolling freely, only what accelerates the wheels' spin goes through the ground: the centre of mass hardly tilts it.
-    np.testing.assert_allclose(states[-1].gravity[:2], [GRAVITY * math.sin(angle) * math.cos(direction), 0.0], atol=1e-9)
+    # On the springs of a plant in space it stands askew by less than a milliradian.
+    askew = 1e-9 if plant_name == "reduced" else 1e-3 * GRAVITY
+    np.testing.assert_allclose(states[-1].gravity[:2], [GRAVITY * math.sin(angle) * math.cos(direction), 0.0], atol=askew)
 
 
 def test_a_braked_robot_on_a_slope_stands_on_its_lower_wheels(plant_name):
@@ -728,7 +730,8 @@ def test_a_displaced_imu_feels_another_centripetal_acceleration(plant_name):
     plain = readings(plant_name, kind=ImuReading)
     for (truth, reading), (_, nominal) in zip(moved[5:], plain[5:], strict=True):
         omega, alpha = truth.twist[2], truth.acceleration[2]
-        expected = [-alpha * y - omega**2 * x, alpha * x - omega**2 * y, 0.0]
+        roll, pitch = truth.swing_acceleration
+        expected = [-alpha * y - omega**2 * x, alpha * x - omega**2 * y, roll * y - pitch * x]
         np.testing.assert_allclose(reading.linear_acceleration - nominal.linear_acceleration, expected, atol=1e-9)
 
 

@@ -20,6 +20,7 @@ def truth(n=4, joint_position=None, joint_velocity=None, **changes):
     velocity = np.zeros((n, 2)) if joint_velocity is None else joint_velocity
     state = PlantState(
         time=0.0, pose=np.zeros(3), twist=np.zeros(3), acceleration=np.zeros(3), gravity=np.array([0.0, 0.0, -9.81]),
+        swing_rate=np.zeros(2), swing_acceleration=np.zeros(2),
         joint_position=position, joint_velocity=velocity, motor_position=position, motor_velocity=velocity,
         motor_torque=np.zeros((n, 2)), slip=np.zeros((n, 2)), contact_force=np.zeros((n, 2)), normal_force=np.zeros(n),
     )
@@ -121,6 +122,16 @@ def test_accelerometer_feels_a_yaw_acceleration_through_its_lever_arm(rng):
     imu = with_imu(position=(0.3, -0.1, 0.2), gyro_noise=0.0, accelerometer_noise=0.0)
     reading = imu.read(truth(acceleration=np.array([0.0, 0.0, 2.0])), rng)
     np.testing.assert_allclose(reading.linear_acceleration, [0.2, 0.6, 9.81], atol=1e-12)
+
+
+def test_an_imu_swings_with_the_chassis_that_carries_it(rng):
+    """Rolled about x and pitched about y, a place at the height z is accelerated by alpha x r; the gyro shows the rates."""
+    imu = with_imu(position=(0.3, -0.1, 0.2), gyro_noise=0.0, accelerometer_noise=0.0)
+    swing, rate = np.array([0.5, -0.8]), np.array([0.01, -0.02])
+    reading = imu.read(truth(swing_acceleration=swing, swing_rate=rate), rng)
+    expected = np.cross([*swing, 0.0], [0.3, -0.1, 0.2]) + [0.0, 0.0, 9.81]
+    np.testing.assert_allclose(reading.linear_acceleration, expected, atol=1e-12)
+    np.testing.assert_allclose(reading.angular_velocity, [0.01, -0.02, 0.0], atol=1e-12)
 
 
 def test_equal_seeds_give_equal_readings():

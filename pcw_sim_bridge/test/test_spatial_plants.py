@@ -8,12 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
+from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription, Rotors
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import PlantError
+from pcw_sim_bridge.run_controllers import make_controller
+from pcw_sim_bridge.simulated_robot import SimulatedRobot, TrackedPose
 from pcw_sim_bridge.traction_test import measure_traction, traction_rig
 
 # The springs of a plant in space pitch and roll by a fraction of a milliradian, the reduced plant does not.
@@ -38,6 +42,51 @@ def test_traction_test_measures_the_peak_friction(engine: str, speed: float) -> 
     assert slip == pytest.approx(robot.contact.lambda_p, abs=0.011)
     expected = 2 * 0.8 * 0.1 * curve.slip_ratio / (0.1**2 + curve.slip_ratio**2)
     np.testing.assert_allclose(curve.friction, expected, rtol=0.01)
+
+
+def test_the_acceleration_is_that_of_the_origin_of_base_link(engine: str) -> None:
+    """Below the springs: of a chassis that swings on them its centre of mass is accelerated otherwise."""
+    robot = load_robot("thesis")
+    plant, torque = make_plant(engine, robot), np.zeros((4, 2))
+    torque[:, DRIVE] = 2.0
+    velocity, acceleration, swing = [], [], []
+    for step in range(200):
+        plant.step(torque * np.sign(np.sin(0.25 * step)))
+        state = plant.state()
+        velocity.append(state.twist[0])
+        acceleration.append(state.acceleration[0])
+        swing.append(state.swing_acceleration[1])
+    plant.close()
+    change = (np.array(velocity)[2:] - np.array(velocity)[:-2]) / (2.0 * plant.dt)
+    np.testing.assert_allclose(acceleration[2:], change, atol=0.01)
+    assert np.abs(swing).max() * robot.chassis.com[2] > 0.1  # m/s^2: the centre of mass is
+
+
+@pytest.mark.parametrize("name", ["tidybot2", "thesis"])
+def test_an_accelerometer_does_not_see_an_engine_s_single_steps(engine: str, name: str) -> None:
+    """Loops of the drives make a robot in space shake by 5 % from step to step; read at every tenth, it had that much more.
+
+    The scale is by regression of the slow part of what is read on that of the speed; the band is 0 to 3 Hz.
+    """
+    robot = load_robot(name)
+    excitation = make_excitation("chirp_x", robot, 29.0, 1)
+    simulated, controller = SimulatedRobot(make_plant(engine, robot)), make_controller("velocity_loops", robot)
+    times, speeds, read = [], [], []
+    while simulated.time_ns < 8_000_000_000:
+        for sample in simulated.advance():
+            if isinstance(sample.reading, TrackedPose) and sample.time_ns % 10_000_000 == 0:
+                truth = sample.reading.truth
+                times.append(sample.time_ns * 1e-9)
+                speeds.append(truth.twist[0])
+                read.append(truth.acceleration[0])
+        twist = excitation.twist(simulated.time_ns * 1e-9)
+        simulated.command(controller.command(sample.reading, twist, simulated.control_period))
+    simulated.close()
+    slow = signal.butter(4, 3.0, fs=1.0 / (times[1] - times[0]), output="sos")
+    of_speed, of_sensor = (signal.sosfiltfilt(slow, values) for values in (np.gradient(speeds, times), read))
+    scale = of_speed @ of_sensor / (of_speed @ of_speed)
+    print(f"reads {scale:.4f} of the acceleration")
+    assert scale == pytest.approx(1.0, abs=0.02)
 
 
 def test_acceleration_loads_the_rear_and_does_not_depend_on_the_heading(engine: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,18 @@ def test_drives_of_unknown_commands_may_hold_speeds(
         recording.joint_commands = None
     problem = RobotProblemBuilder(FLOW_BASE, [recording], CUTOFF).build(with_terms=False)
     assert {n.name for n in problem.nuisances if n.name.startswith("torque_report.drive")} == expected_numbers
+
+
+@pytest.mark.parametrize("controller", ["velocity_loops", "computed_torque"])
+def test_an_accelerometer_may_be_read_in_step_with_drives_that_hold_speeds(tmp_path: Path, controller: str) -> None:
+    """A healthy robot was told of an accelerometer that reads 9 % too much, for certain; torques leap once a cycle alone."""
+    robot = load_robot("thesis")
+    recording = Recording.open(run(robot, controller, tmp_path, "steps", 12.0), robot)
+    problem = RobotProblemBuilder(robot, [recording], CUTOFF).build(with_terms=False)
+    found = {n.name: n.deviation for n in problem.nuisances if n.name.startswith("imu.report")}
+    assert set(found) == ({"imu.report.x", "imu.report.y"} if controller == "velocity_loops" else set())
+    cycle = float(np.median(np.diff(recording.joint_states.stamp)))
+    assert list(found.values()) == pytest.approx([50.0 * cycle / math.sqrt(3.0)] * len(found), rel=0.01)
 
 
 def test_no_factor_of_all_torques_and_masses_takes_errors_away(tmp_path: Path) -> None:

@@ -1,13 +1,4 @@
-"""How a chassis sways on the springs over its wheels: an inverted pendulum whose foot is accelerated.
-
-About the line on the floor around which it leans, with mass m, height h, inertia I + m h^2, and springs k and dampers c at
-the distances x from that line,
-
-    (I + m h^2) theta'' + c sum(x^2) theta' + (k sum(x^2) - m g h) theta = m h a,
-
-so the centre of mass stays behind where a rigid body would have it by h theta: by `lean` times the acceleration a that a
-resonator at `frequency`, with `damping`, makes of a.
-"""
+"""What a chassis on its springs makes of accelerations: what a resonator of its `sway_numbers` does."""
 
 from __future__ import annotations
 
@@ -18,7 +9,8 @@ import math
 import numpy as np
 from scipy import signal
 
-from pcw_description.robot_description import GRAVITY, RobotDescription
+from pcw_description.chassis_sway import sway_numbers
+from pcw_description.robot_description import RobotDescription
 
 from .regression_problem import FloatArray
 
@@ -43,22 +35,7 @@ class ChassisSway:
     @classmethod
     def of(cls, robot: RobotDescription) -> ChassisSway:
         """Take it from a description; a robot that its springs would not hold upright does not sway here."""
-        chassis, springs = robot.chassis, robot.wheel_suspension
-        lean, frequency, damping = np.zeros(2), np.ones(2), np.ones(2)
-        mass = robot.total_mass
-        masses = np.array([chassis.mass, *(c.module.mass for c in robot.casters)])
-        heights = np.array([chassis.com[2], *robot.wheel_radius])
-        height = float(masses @ heights) / mass
-        about_x, about_y, _ = chassis.principal_inertias()
-        for k, own in enumerate((about_y, about_x)):
-            arms = robot.steer_axis[:, k] - robot.steer_axis[:, k].mean()
-            inertia = own + float(masses @ heights**2)
-            stiffness = springs.stiffness * float(arms @ arms) - mass * GRAVITY * height
-            if stiffness > 0.0:
-                lean[k] = mass * height**2 / stiffness
-                frequency[k] = math.sqrt(stiffness / inertia)
-                damping[k] = springs.damping * float(arms @ arms) / (2.0 * math.sqrt(stiffness * inertia))
-        return cls(lean, frequency, damping)
+        return cls(*sway_numbers(robot))
 
     def response(self, acceleration: FloatArray, rate: float, detuning: float = 0.0) -> FloatArray:
         """What the resonators make of accelerations (T, 2) at `rate` [Hz], their frequencies changed by a part."""

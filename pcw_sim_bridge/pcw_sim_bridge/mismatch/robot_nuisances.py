@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 from .all_cores import on_all_cores
 from .channel_differences import ChannelDifferences
 from .regression_problem import FloatArray, Nuisance
+from .robot_motion import RobotMotion
 from .rolling_model import ModelNumbers
 
 Vary = Callable[[ModelNumbers, float], None]
@@ -99,6 +100,8 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
         # Nor does anybody know how much rubber damps: by that a soft tyre would be found too short or too long.
         found.append(VariedNumber("contact.damping_time", "s", DAMPING_TIME, 0.5 * DAMPING_TIME, _entry("damping_time")))
         found += _unreported(differences)
+    if layout.imu:
+        found += _within_cycle(differences)
     found += _suspension(differences)
     deviations = list(_geometry(robot))
     if layout.balanced:
@@ -225,7 +228,7 @@ def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
     motions = [motion for motion in differences.motions if np.any(motion.loops)]
     if not motions:
         return
-    part = min(LOOP_BANDWIDTH * max(motion.sampling for motion in motions), LARGEST_UNREPORTED)
+    part = _largest_part(motions)
     behind = any(np.any(motion.loops[..., 1]) for motion in motions)
     layout = differences.model.layout
     owners: Mapping[str, int | slice] = {"": slice(None)}
@@ -237,6 +240,23 @@ def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
             if behind:
                 label, deviation = f"torque_report.{name}_behind{of}", 0.5 * LOOP_BANDWIDTH * part
                 yield VariedNumber(label, "1/s", 0.0, deviation, _entry("unreported", (own, axis, 1)))
+
+
+def _largest_part(motions: Sequence[RobotMotion]) -> float:
+    """How far what accelerates a joint whose drive holds speeds strays from its mean within a cycle, relative."""
+    return min(LOOP_BANDWIDTH * max(motion.sampling for motion in motions), LARGEST_UNREPORTED)
+
+
+def _within_cycle(differences: ChannelDifferences) -> Iterator[VariedNumber]:
+    """What an accelerometer that is read in step with drives that hold speeds reads more than the mean of their cycle.
+
+    The robot's acceleration leaps and fades with their torques, evenly between the part above and the part below its mean. A
+    sensor of 100 Hz beside joint_states of 200 Hz meets the same instant of the cycle for ever: no scale of the sensor.
+    """
+    motions = [motion for motion in differences.motions if np.any(motion.loops)]
+    for k, axis in enumerate("xy" if motions else ""):
+        deviation = _largest_part(motions) / math.sqrt(3.0)
+        yield VariedNumber(f"imu.report.{axis}", "1", 0.0, deviation, _entry("accelerometer_scale", k))
 
 
 def _geometry(robot: RobotDescription) -> Iterator[Deviation]:

@@ -59,8 +59,8 @@ from .signal_filter import derivative
 
 # Of the numbers of the model those that say nothing of how wheels move, but what is felt, sensed and slips.
 OF_NO_MOTION = frozenset((
-    "gain", "torque_lag", "unreported", "tyres", "damping_time", "softness", "imu_position", "gyro_bias", "gyro_scale",
-    "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock", "tracked",
+    "gain", "torque_lag", "unreported", "tyres", "damping_time", "softness", "imu_position", "imu_height", "gyro_bias",
+    "gyro_scale", "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock", "tracked",
 ))  # fmt: skip
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
@@ -229,8 +229,8 @@ class ModelNumbers:
         steer_axis, caster_offset, radius: geometry (n, 2), (n, 2), (n,).
         steer_zero: error of the measured headings (n,) [rad].
         gain: true over reported motor torque (n, 2).
-        imu_position: (2,) [m]; gyro_bias [rad/s]; gyro_scale; accelerometer_bias: (2,) [m/s^2];
-            accelerometer_scale: (2,).
+        imu_position: (2,) [m]; imu_height: above the floor [m]; gyro_bias [rad/s]; gyro_scale;
+            accelerometer_bias: (2,) [m/s^2]; accelerometer_scale: (2,).
         axle: fixed axles (k, 3), k of 0 or 1: their middle [m] and heading [rad].
         tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
         tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
@@ -258,6 +258,7 @@ class ModelNumbers:
     steer_zero: FloatArray
     gain: FloatArray
     imu_position: FloatArray
+    imu_height: float
     gyro_bias: float
     gyro_scale: float
     accelerometer_bias: FloatArray
@@ -326,6 +327,7 @@ class ModelNumbers:
             steer_zero=np.zeros(robot.n),
             gain=np.ones((robot.n, 2)),
             imu_position=np.array(imu.position[:2]) if imu else np.zeros(2),
+            imu_height=imu.position[2] if imu else 0.0,
             gyro_bias=0.0,
             gyro_scale=1.0,
             accelerometer_bias=np.zeros(2),
@@ -746,7 +748,8 @@ class WheelMotion:
         offset: of the contacts from the steering axes in the wheel frames (T, n, 2) [m].
         velocity: joint rates that wheels of the described radius would have (T, n, 2).
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
-        felt: the latter of a robot on level ground under the same forces (T, 3); tilt: of its chassis (T, 2).
+        felt: the latter of a robot on level ground under the same forces (T, 3); tilt: of its chassis (T, 2), standing: the
+            part of it by the heights under its wheels.
         normal, speed: loads [N] and rolling speeds [m/s] (T, n + k), fixed axles last.
     """
 
@@ -765,6 +768,7 @@ class WheelMotion:
     contradiction: FloatArray
     felt: FloatArray
     tilt: FloatArray
+    standing: FloatArray
     normal: FloatArray
     speed: FloatArray
 
@@ -816,8 +820,10 @@ def wheel_motion(motion: RobotMotion, numbers: ModelNumbers, around: Surrounding
     tilt = np.zeros((len(twist), 2))
     if leaning is not None:
         tilt = _tilt(numbers, leaning, numbers.lean, direction)
+    standing = np.zeros_like(tilt)
     if around.height is not None:
-        tilt = tilt + _gradients(numbers.steer_axis, numbers.caster_offset, direction, around.height)
+        standing = _gradients(numbers.steer_axis, numbers.caster_offset, direction, around.height)
+        tilt = tilt + standing
     if tilt.any():
         offset = _offsets(numbers, direction, tilt)
         twist, contradiction = _twists(numbers, steer_angle, direction, velocity, offset)
@@ -827,7 +833,7 @@ def wheel_motion(motion: RobotMotion, numbers: ModelNumbers, around: Surrounding
     speed = np.concatenate([np.abs(velocity[:, :, DRIVE] * numbers.radius), _axle_speeds(numbers, twist)], axis=1)
     return WheelMotion(
         motion, numbers, around.radius, around.pull, around.height,
-        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, felt, tilt, normal, speed,
+        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, felt, tilt, standing, normal, speed,
     )  # fmt: skip
 
 
@@ -941,10 +947,17 @@ def channel_sides(
         rate = numbers.gyro_scale * omega + numbers.gyro_bias
         along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x
         across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y
+        standing = numbers.sway.response(wheels.standing, motion.rate) if wheels.standing.any() else wheels.standing
+        tilt = standing if leaning is None else standing + leaning / numbers.height_of_mass
+        if tilt.any():
+            # The higher a sensor stands, the farther it swings with the chassis.
+            swinging = numbers.imu_height * derivative(derivative(tilt, motion.rate), motion.rate)
+            # And as it leans with it, it feels a part of its weight.
+            thrown = GRAVITY * standing - swinging
+            along, across = along + thrown[:, 0], across + thrown[:, 1]
         felt = numbers.accelerometer_scale * np.stack([along, across], axis=1) + numbers.accelerometer_bias
         sensed = np.concatenate([rate[:, None], felt], axis=1)
         if numbers.imu_lean.any():
-            # A sensor that leans feels a part of its weight.
             leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
             sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, wheels.direction)
         predicted.append(sensed)

@@ -27,7 +27,11 @@ class PlantState:
         pose: pose of base_link in the world (x, y, yaw), yaw continuous [m, m, rad].
         twist: twist of base_link in base_link (v_x, v_y, omega) [m/s, m/s, rad/s].
         acceleration: acceleration of base_link's origin in base_link, and yaw acceleration (3,) [m/s^2, m/s^2, rad/s^2].
-        gravity: (3,) in base_link, not (0, 0, -g) on a slope [m/s^2].
+            Of an engine in space the mean over the last two steps: from one to the next they alternate around what a robot
+            does, and no accelerometer is as fast.
+        gravity: (3,) in base_link, not (0, 0, -g) on a slope, or where the chassis leans on its springs [m/s^2].
+        swing_rate, swing_acceleration: roll and pitch of the chassis on its springs, about x and y of base_link (2,)
+            [rad/s], [rad/s^2]; the reduced plant knows those over uneven ground and over wheels that give way.
         joint_position: (n, 2) [rad], continuous.
         joint_velocity: (n, 2) [rad/s].
         motor_position, motor_velocity: what the encoders on the motors see, as the joint motion (n, 2) that rigid gears
@@ -43,6 +47,8 @@ class PlantState:
     twist: FloatArray
     acceleration: FloatArray
     gravity: FloatArray
+    swing_rate: FloatArray
+    swing_acceleration: FloatArray
     joint_position: FloatArray
     joint_velocity: FloatArray
     motor_position: FloatArray

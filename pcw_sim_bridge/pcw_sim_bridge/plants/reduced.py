@@ -12,7 +12,7 @@ The joints are eliminated caster by caster, which leaves a 3x3 system (Schur com
 accelerations of the last step quasi-statically, as a rigid body on equal springs that push and do not pull. On uneven ground,
 or on a wheel that gives way, the chassis stands as the plane nearest to the heights under its wheels does, and its steering
 axes with it: with t the vertical in its horizontal axes, the contact is where the wheel is lowest, b_x - r t_x in the wheel's
-frame, and weights turn the steering by (N b - m g c) x t.
+frame, and weights turn the steering by (N b - m g c) x t. What an IMU feels of that follows as the springs let it.
 
 A step takes tyres, friction and gears implicitly in the new velocities, by their slopes. The tyre force F at the end of
 a step follows from the step's mean slip velocity eps = J (v + v') / 2: with G the slopes of F over eps, the matrix is
@@ -29,6 +29,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pcw_description.chassis_sway import sway_numbers
 from pcw_description.compiled import compiled
 from pcw_description.contact.contact_model import scrub_torque, slip_under_load, tyre_step_with_slopes
 from pcw_description.effects.kinds import (
@@ -43,7 +44,7 @@ from pcw_description.effects.kinds import (
     RADIUS_SLOPE,
 )
 from pcw_description.recording_series import IntArray
-from pcw_description.robot_description import FloatArray, RobotDescription
+from pcw_description.robot_description import GRAVITY, FloatArray, RobotDescription
 from pcw_description.support_forces import plane_gradient, support_forces
 
 from .caster_arrays import (
@@ -85,8 +86,10 @@ from .surroundings import chassis_wrench, ground_under
 from .true_robot import as_it_really_is, without_geared_rotors
 
 # Entries of the chassis numbers and of the body state.
-_M, _COM_X, _COM_Y, _I, _COM_Z, _SPRING, _LIFTED = range(7)
-_X, _Y, _YAW, _VX, _VY, _OMEGA, _AX, _AY, _ALPHA, _TIME = range(10)
+_M, _COM_X, _COM_Y, _I, _COM_Z, _SPRING, _LIFTED, _FREQUENCY, _DAMPING = (*range(8), 9)
+_X, _Y, _YAW, _VX, _VY, _OMEGA, _AX, _AY, _ALPHA, _TIME, _STANDS, _TILT, _TILTING, _TILTED = (*range(12), 13, 15)
+_BODY_STATE = 17
+FASTEST_SWAY = 0.5  # radians of a period in a step
 # Per-caster numbers within a step: place and turn of the wheel, forces, and the two rows of what is eliminated.
 _C, _S, _PX, _PY, _FORCE_X, _FORCE_Y, _SPIN, _RHS_R, _RHS_P, _I_RR, _I_RP, _I_PP = range(12)
 _KR0, _KR1, _KR2, _KP0, _KP1, _KP2, _DZ_X, _DZ_Y, _G_X, _G_Y, _E_X0, _E_X1, _E_X2, _E_Y0, _E_Y1, _E_Y2, _R = range(12, 29)
@@ -105,7 +108,7 @@ def _advance(  # type: ignore[no-untyped-def]
     body,
     wheels,
 ):
-    """Advance body (10,) and wheels (n, WHEEL_STATE) in place by `steps` steps with the motor torques command (n, 2) held.
+    """Advance body (_BODY_STATE,) and wheels (n, WHEEL_STATE) in place by `steps` steps, motor torques command (n, 2) held.
 
     Returns False, and changes nothing, if a torque is not finite.
     """
@@ -149,6 +152,15 @@ def _advance(  # type: ignore[no-untyped-def]
             height[i] = ground[i, HEIGHT] + ground[i, RADIUS_CHANGE]
         com_x, com_y, com_z = com_x / total_mass, com_y / total_mass, com_z / total_mass
         tilt_x, tilt_y = plane_gradient(centre, height)
+        for k, tilt in enumerate((tilt_x, tilt_y)):
+            if body[_STANDS] == 0.0:  # as the ground is where it was put
+                body[_TILT + k], body[_TILTING + k] = tilt, 0.0
+            pace = chassis[_FREQUENCY + k]
+            pushed = pace * (pace * (tilt - body[_TILT + k]) - 2.0 * chassis[_DAMPING + k] * body[_TILTING + k])
+            body[_TILTED + k] = pushed
+            body[_TILTING + k] += dt * pushed
+            body[_TILT + k] += dt * body[_TILTING + k]
+        body[_STANDS] = 1.0
         chassis_wrench(
             body[_TIME], body[_X], body[_Y], body[_YAW], vx, vy, omega, com_x, com_y, com_z, effects, at, wrench
         )
@@ -349,7 +361,7 @@ def _roll_out(  # type: ignore[no-untyped-def]
 ):
     """Fill bodies (W, K, 6) and joints (W, K, n, 4) of `ReducedPlant.roll_out`; False if a torque is not finite."""
     windows, rows, n, _ = torque.shape
-    body, wheels = np.empty(10), np.empty((n, WHEEL_STATE))
+    body, wheels = np.empty(_BODY_STATE), np.empty((n, WHEEL_STATE))
     for w in range(windows):
         body[:] = 0.0
         wheels[:] = 0.0
@@ -425,12 +437,16 @@ class ReducedPlant:
         true_robot = as_it_really_is(robot)
         chassis = true_robot.chassis
         spring = true_robot.wheel_suspension.stiffness
-        self._chassis = np.array(
-            [chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2], spring, float(lifted)]
-        )
+        lean, frequency, damping = sway_numbers(true_robot)
+        # What no spring holds upright stands as the ground does.
+        frequency = np.where(lean > 0.0, np.minimum(frequency, FASTEST_SWAY / dt), FASTEST_SWAY / dt)
+        self._chassis = np.array([
+            chassis.mass, chassis.com[0], chassis.com[1], chassis.inertia_zz, chassis.com[2], spring, float(lifted),
+            *frequency, *damping,
+        ])  # fmt: skip
         self._casters = caster_numbers(without_geared_rotors(true_robot))
         self._effects = EffectTables(true_robot, dt)
-        self._body = np.zeros(10)
+        self._body = np.zeros(_BODY_STATE)
         self._wheels = np.zeros((robot.n, WHEEL_STATE))
         self.reset()
 
@@ -480,12 +496,17 @@ class ReducedPlant:
         body, wheels = self._body, self._wheels
         joint_position, joint_velocity = wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
         motor_position, motor_velocity = self._effects.motor_motion(joint_position, joint_velocity)
+        gravity = gravity_in_base(self._effects.gravity, body[_YAW])
+        gravity[:2] -= GRAVITY * body[_TILT:_TILTING]
         return PlantState(
             time=self._steps * self.dt,
             pose=body[_X : _YAW + 1].copy(),
             twist=body[_VX : _OMEGA + 1].copy(),
             acceleration=body[_AX : _ALPHA + 1].copy(),
-            gravity=gravity_in_base(self._effects.gravity, body[_YAW]),
+            gravity=gravity,
+            # The vertical leans along x by a turn about -y, and along y by one about x.
+            swing_rate=np.array([body[_TILTING + 1], -body[_TILTING]]),
+            swing_acceleration=np.array([body[_TILTED + 1], -body[_TILTED]]),
             joint_position=joint_position,
             joint_velocity=joint_velocity,
             motor_position=motor_position,

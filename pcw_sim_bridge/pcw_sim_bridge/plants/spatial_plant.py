@@ -113,7 +113,7 @@ def _take_accelerations(  # type: ignore[no-untyped-def]
 
 @compiled
 def _seen_from_above(base, acceleration, com_in_base, gravity, turned_yaw):  # type: ignore[no-untyped-def]
-    """Return the yaw [rad], continuous, and in the rows of (4, 3) pose, twist, acceleration and gravity; see `PlantState`."""
+    """Return the yaw [rad], continuous, and in rows (6, 3) pose, twist, acceleration, gravity and swing of a `PlantState`."""
     rotation = rotation_matrix(base[3:7])
     arm = np.empty(3)
     for k in range(3):
@@ -125,15 +125,17 @@ def _seen_from_above(base, acceleration, com_in_base, gravity, turned_yaw):  # t
     # The engine's yaw is wrapped; the integrated rate says which turn it is.
     yaw = heading + 2.0 * math.pi * round((turned_yaw - heading) / (2.0 * math.pi))
     c, s = math.cos(yaw), math.sin(yaw)
-    acceleration_x = acceleration[0] - acceleration[5] * arm[1] - yaw_rate * yaw_rate * arm[0]
-    acceleration_y = acceleration[1] + acceleration[5] * arm[0] - yaw_rate * yaw_rate * arm[1]
-    truth = np.empty((4, 3))
+    acceleration_x = acceleration[0] + acceleration[4] * arm[2] - acceleration[5] * arm[1] - yaw_rate * yaw_rate * arm[0]
+    acceleration_y = acceleration[1] + acceleration[5] * arm[0] - acceleration[3] * arm[2] - yaw_rate * yaw_rate * arm[1]
+    truth = np.zeros((6, 3))
     truth[0, 0], truth[0, 1], truth[0, 2] = base[0] + arm[0], base[1] + arm[1], yaw
     truth[1, 0], truth[1, 1], truth[1, 2] = c * velocity_x + s * velocity_y, c * velocity_y - s * velocity_x, yaw_rate
     truth[2, 0], truth[2, 1] = c * acceleration_x + s * acceleration_y, c * acceleration_y - s * acceleration_x
     truth[2, 2] = acceleration[5]
-    truth[3, 0], truth[3, 1] = c * gravity[0] + s * gravity[1], c * gravity[1] - s * gravity[0]
-    truth[3, 2] = gravity[2]
+    for k in range(3):
+        truth[3, k] = rotation[0, k] * gravity[0] + rotation[1, k] * gravity[1] + rotation[2, k] * gravity[2]
+    truth[4, 0], truth[4, 1] = c * roll_rate + s * pitch_rate, c * pitch_rate - s * roll_rate
+    truth[5, 0], truth[5, 1] = c * acceleration[3] + s * acceleration[4], c * acceleration[4] - s * acceleration[3]
     return yaw, truth
 
 
@@ -189,7 +191,7 @@ class SpatialPlant:
         if steer_angle is not None:
             joints[:, PHI - RHO] = steer_angle
         self._wheels[:] = 0.0
-        self._acceleration, self._angular_acceleration = np.zeros(6), np.zeros(3)
+        self._acceleration, self._acceleration_before, self._angular_acceleration = np.zeros(6), np.zeros(6), np.zeros(3)
         self._yaw = float(start[2])
         self._steps = 0
         self._effects.reset()
@@ -210,7 +212,7 @@ class SpatialPlant:
         self._wheels[:, FZ] = normal_force
         self._effects.reset()
         self._place(start, height, turned(attitude, start[2] - heading_of(rotation)), joints)
-        self._acceleration[:] = 0.0
+        self._acceleration[:] = self._acceleration_before[:] = 0.0
         self._angular_acceleration[:] = 0.0
         self._yaw = float(start[2])
         self._steps = 0
@@ -253,6 +255,7 @@ class SpatialPlant:
         self._wheels[:, PUSH_X : PUSH_Y + 1] = np.nan
 
     def _single_step(self, command: FloatArray) -> None:
+        self._acceleration_before[:] = self._acceleration
         before, rates_before = self._base.copy(), self._wheels[:, RHO_DOT : PHI_DOT + 1].copy()
         wrench, joint_torque = contact_wrench(
             self.dt,
@@ -303,9 +306,8 @@ class SpatialPlant:
 
     def state(self) -> PlantState:
         """Return the truth now; the pose is that of base_link's origin, seen from above."""
-        self._yaw, truth = _seen_from_above(
-            self._base, self._acceleration, self._com_in_base, self._effects.gravity, self._yaw
-        )
+        acceleration = 0.5 * (self._acceleration + self._acceleration_before)
+        self._yaw, truth = _seen_from_above(self._base, acceleration, self._com_in_base, self._effects.gravity, self._yaw)
         wheels = self._wheels
         joint_position, joint_velocity = wheels[:, RHO : PHI + 1].copy(), wheels[:, RHO_DOT : PHI_DOT + 1].copy()
         motor_position, motor_velocity = self._effects.motor_motion(joint_position, joint_velocity)
@@ -315,6 +317,8 @@ class SpatialPlant:
             twist=truth[1],
             acceleration=truth[2],
             gravity=truth[3],
+            swing_rate=truth[4, :2],
+            swing_acceleration=truth[5, :2],
             joint_position=joint_position,
             joint_velocity=joint_velocity,
             motor_position=motor_position,
