@@ -146,6 +146,15 @@ def test_the_analysis_does_not_read_the_answers(challenge: Path, tmp_path: Path)
     assert json.dumps(reports[0]) == json.dumps(reports[1])
 
 
+def test_baselines_without_what_they_need_are_told_before_any_analysis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After minutes of the first case it was said that a package is missing."""
+    monkeypatch.setattr("pcw_sim_bridge.mismatch.baselines.comparison_packages.MODULES", ("no_such_package",))
+    with pytest.raises(MismatchError, match="no_such_package"):
+        run(tmp_path, lambda message: None, baselines=True)
+
+
 # Expressions, as a worker process can import `eval` and not a function of a test.
 MISMATCH_ERROR = "__import__('pcw_sim_bridge.mismatch.errors', fromlist=['MismatchError']).MismatchError('no such thing')"
 TASKS = {

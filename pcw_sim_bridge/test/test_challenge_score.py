@@ -312,14 +312,15 @@ def test_answers_that_are_not_those_sealed_are_refused(tmp_path: Path) -> None:
 
 def test_baselines_on_the_same_cases() -> None:
     """A method names targets, too, and a remark is no error: one seemed never to have run, and none to be right."""
-    said = {"name": "other", "named": ["drive_coulomb_friction/rear_left", "x"], "inverse_nrmse": [0.4, 0.2], "seconds": 2.0,
+    said = {"name": "other", "named": ["drive_coulomb_friction/front_left", "x"], "inverse_nrmse": [0.4, 0.2], "seconds": 2.0,
             "remark": "48 numbers"}
     own = dataclasses.replace(judged(SINGLE, report()), baselines=[said])
     failed = {"name": "third", "named": [], "inverse_nrmse": None, "seconds": 0.1, "remark": "no data"}
     healthy = dataclasses.replace(judged(answer("none"), report()), baselines=[said, failed])
     from pcw_sim_bridge.mismatch.challenge.score import tables
 
-    [table] = [t for t in tables([own, healthy]) if t.title.startswith("Baselines")]
-    assert table.rows == (
-        ("other", "2 of 2", "1 of 1", "1 of 1", "0.50", "2.0 s"), ("third", "0 of 1", "", "", "", ""),
-    )  # fmt: skip
+    [table] = [t for t in tables([own, healthy]) if t.title.startswith("Other methods")]
+    ours, other, third = table.rows
+    assert ours[:2] == ("mismatch analyze", "2 of 2") and ours[2:6] == ("0 of 1", "0 of 1", "0 (0)", "0 of 1")
+    assert other == ("other", "2 of 2", "0 of 1", "1 of 1", "2 (2)", "1 of 1", "0.50", "0 of 2", "2.0 s")
+    assert third == ("third", "0 of 1", *7 * [""])

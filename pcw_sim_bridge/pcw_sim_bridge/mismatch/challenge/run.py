@@ -39,10 +39,10 @@ def run(
         Names of the cases that failed; the next run tries them again.
 
     Raises:
-        MismatchError: no cases there, or no baselines in this installation.
+        MismatchError: no cases there, or no baselines in this installation, or not what they need.
     """
     if baselines:
-        _baseline_function()
+        _baseline_function()  # before an analysis of minutes
     cases = case_folders(folder)
     reports = reports or folder / "reports"
     todo = [case for case in cases if not _is_done(reports / case.name, baselines)]
@@ -118,9 +118,10 @@ def _noise_floors(out: Path) -> dict[str, float]:
 
 def _baseline_function() -> Callable[..., Sequence[Any]]:
     try:
-        from ..baselines import run_baselines
+        from ..baselines import require_packages, run_baselines
     except ImportError as error:
         raise MismatchError(f"--baselines: not in this installation ({error}); allowed: without --baselines") from None
+    require_packages()
     return run_baselines
 
 

@@ -381,26 +381,51 @@ def _parameters(judged: Sequence[Judgement]) -> Table:
 
 
 def _baselines(judged: Sequence[Judgement]) -> Table:
-    """Other people's methods: `name`, `named` (list), `inverse_nrmse` [before, after] if it ran, `seconds` of each."""
+    """Other people's methods, and ours on the cases that they had; those of a method are the cases that it ran on."""
     by_name: dict[str, list[tuple[Judgement, Mapping[str, Any]]]] = {}
     for j in judged:
-        for entry in j.baselines:
+        for entry in (_as_baseline(j), *j.baselines) if j.baselines else ():
             by_name.setdefault(str(entry["name"]), []).append((j, entry))
     rows = []
-    for name, entries in sorted(by_name.items()):
+    for name, entries in by_name.items():
         ran = [(j, e) for j, e in entries if e.get("inverse_nrmse")]
+        hidden = [(set(j.truth), {_key(said) for said in e["named"]}) for j, e in ran if j.truth]
         healthy = [e for j, e in ran if j.kind == "none"]
-        ratios = [e["inverse_nrmse"][1] / e["inverse_nrmse"][0] for _, e in ran]
+        counts = [len(e["named"]) for _, e in ran]
+        errors = [e["inverse_nrmse"] for _, e in ran]
+        ratios = [after / before for before, after in errors]
         times = [e["seconds"] for _, e in ran if "seconds" in e]
         rows.append((
             name, f"{len(ran)} of {len(entries)}",
-            _ratio(sum({k[0] for k in j.truth} <= {n.partition("/")[0] for n in e["named"]} for j, e in ran if j.truth),
-                   sum(bool(j.truth) for j, _ in ran)),
-            _ratio(sum(bool(e.get("named")) for e in healthy), len(healthy)),
-            f"{np.median(ratios):.2f}" if ratios else "", f"{np.median(times):.1f} s" if times else "",
+            _ratio(sum(truth == named for truth, named in hidden), len(hidden)),
+            _ratio(sum(truth <= named for truth, named in hidden), len(hidden)),
+            f"{np.median(counts):.0f} ({max(counts)})" if counts else "",
+            _ratio(sum(bool(e["named"]) for e in healthy), len(healthy)),
+            f"{np.median(ratios):.2f}" if ratios else "", _ratio(sum(ratio > 1.0 for ratio in ratios), len(ratios)),
+            f"{np.median(times):.1f} s" if times else "",
         ))
-    head = ("method", "ran", "all effects among its names", "names on healthy cases", "held-out error left", "time")
-    return Table("Baselines on the same cases", head, tuple(rows))
+    head = (
+        "method", "ran", "these effects and no other", "these among others", "names, median (most)", "names on healthy cases",
+        "held-out error left, median", "held-out error grew", "time, median",
+    )  # fmt: skip
+    return Table("Other methods on the same cases", head, tuple(rows))
+
+
+def _as_baseline(j: Judgement) -> Mapping[str, Any]:
+    """What the analyser says of a case, as other methods' results are kept."""
+    if j.report is None:
+        return {"name": "mismatch analyze", "named": [], "inverse_nrmse": None}
+    fit = j.report["fit"]
+    return {
+        "name": "mismatch analyze", "named": ["/".join((n.key[0], "+".join(n.key[1]))) for n in j.named],
+        "inverse_nrmse": fit and fit["holdout"]["inverse_nrmse"], **j.usage,
+    }  # fmt: skip
+
+
+def _key(named: str) -> tuple[str, frozenset[str]]:
+    """An effect and its target, or whatever else a method has named."""
+    name, _, target = named.partition("/")
+    return name, frozenset(target.split("+"))
 
 
 def _ratio(count: int, total: int) -> str:
