@@ -10,6 +10,7 @@ import pytest
 
 from pcw_description import RobotDescription, load_robot
 from pcw_description.effect_instance import EffectInstance
+from pcw_description.effects.kinds import ActuatorEffect
 from pcw_description.effects.registry import all_effects
 from pcw_description.errors import DescriptionError
 from pcw_description.recording import Recording
@@ -29,6 +30,7 @@ from pcw_sim_bridge.mismatch.challenge.concealed_effects import (
     CANCELLING,
     HIDDEN_BY_CONTROL,
     NEEDS_IMU,
+    NEEDS_TORQUE_COMMANDS,
     RECIPES,
     SILENT_IN,
     Scene,
@@ -414,6 +416,19 @@ def test_some_healthy_robots_do_one_plain_manoeuvre_by_their_own_loops() -> None
     assert 0 < len(plain) < len(drawn)
     assert {run["excitation"] for answer in plain for run in answer["runs"][:1]} <= {*PLAIN_EXCITATIONS, "identification"}
     assert len({answer["runs"][0]["excitation"] for answer in plain}) > 2
+
+
+def test_what_torque_commands_alone_show_is_concealed_where_torques_are_commanded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lags of motors behind loops of their drives, whose gains nobody describes, were counted as missed."""
+    monkeypatch.setattr(cases, "PLAIN_SHARE", 1.0)
+    order = order_cases(1, 2, kinds=("single",), plants=("reduced",), durations=(15.0, 16.0))[0]
+
+    def controller(name: str) -> str:
+        return cases._Drawing(dataclasses.replace(order, effects=(name,)), np.random.default_rng(1))._world.controller
+
+    assert NEEDS_TORQUE_COMMANDS == {name for name, effect in all_effects().items() if isinstance(effect, ActuatorEffect)}
+    assert {controller(name) for name in NEEDS_TORQUE_COMMANDS} == {"computed_torque"}
+    assert controller("drive_coulomb_friction") == "velocity_loops"
 
 
 def test_one_way_of_tyres_is_not_hidden_by_making_another_effect_of_it() -> None:

@@ -27,6 +27,7 @@ from .concealed_effects import (
     CANCELLING,
     HIDDEN_BY_CONTROL,
     NEEDS_IMU,
+    NEEDS_TORQUE_COMMANDS,
     RECIPES,
     SILENT_IN,
     Draft,
@@ -215,7 +216,8 @@ class _Drawing:
         self._noise = _log_uniform(rng, *NOISE_RANGE)
         self._deviations = draw_deviations(self._base, rng)
         self._plain = order.kind in PLAIN_KINDS and rng.random() < PLAIN_SHARE
-        controller = "velocity_loops" if self._plain or order.masking == "closed_loop" else "computed_torque"
+        by_speeds = (self._plain or order.masking == "closed_loop") and not NEEDS_TORQUE_COMMANDS & set(order.effects)
+        controller = "velocity_loops" if by_speeds else "computed_torque"
         true = _noisy(with_deviations(self._base, self._deviations), self._noise)
         self._world = World(self._base, true, order.plant, controller)
         self._fit = [self._run("recordings/run_1", self._excitation())]

@@ -492,6 +492,8 @@ RECIPES: Mapping[str, Callable[[Scene], Recipe]] = {
     "coupled_friction": _outside_torque("drive", 0.01, 0.1),
 }
 NEEDS_IMU = frozenset({"imu_bias", "imu_scale", "imu_lever_arm", "clock_offset"})
+# What happens between a torque's command and its report: where speeds are commanded nothing recorded shows it.
+NEEDS_TORQUE_COMMANDS = frozenset({"actuator_delay", "actuator_lag", "torque_saturation"})
 
 # A path that a controller with fast joint loops holds however hard the joints go: these then show in the torques alone.
 HIDDEN_BY_CONTROL = (
