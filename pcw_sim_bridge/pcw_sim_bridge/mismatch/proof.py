@@ -398,7 +398,8 @@ class Prover:
         floors: dict[int | None, FloatArray] = {}
         for index in moving:
             without = self._rollout(explanation, held_out, index)
-            assert without is not None
+            if without is None:
+                continue
             # Where a simulation ran away it says nothing for or against an effect.
             away = _ran_away(windows, without) | _ran_away(windows, after)
             if np.sum(~away) < LEAST_WINDOWS:
@@ -449,11 +450,14 @@ class Prover:
         return moves_the_robot(explanation.search.problem.terms[instance.term].effect)
 
     def _rollout(self, explanation: Explanation, held_out: HeldOut, without: int | None = None) -> FloatArray | None:
-        """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold."""
+        """Squared errors (W, H, S) of the patched description, each window by the patch of its own fold; None for no robot."""
         if self.windows is None or self.before is None:
             return None
         if not self._is_patched(explanation):
             return self.before
+        # Numbers re-tuned beside an effect, or an effect beside another, may make no robot alone.
+        if not self._can_be(explanation, held_out, without):
+            return None
         windows, fold = self.windows, _fold_of(held_out, self.windows)
         after = np.full_like(self.before, np.nan)
         problem, retuned = explanation.search.problem, self._numbers(explanation)
