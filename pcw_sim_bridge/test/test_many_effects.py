@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from pcw_description.effect_instance import EffectInstance
-from pcw_sim_bridge.mismatch.analysis import MOST_AT_ONCE, doubted_in_a_crowd, doubted_in_a_gap
+from pcw_sim_bridge.mismatch.analysis import (
+    MOST_AT_ONCE,
+    doubted_beside_a_turn,
+    doubted_in_a_crowd,
+    doubted_in_a_gap,
+)
 from pcw_sim_bridge.mismatch.explanation import NamedTerm
 from pcw_sim_bridge.mismatch.regression_problem import Term
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -50,3 +55,14 @@ def test_what_is_at_work_once_need_not_close_the_gap_of_another_recording() -> N
     entry, instance = named("external_push", "left")
     once = dataclasses.replace(entry, term=dataclasses.replace(entry.term, once=True))
     assert doubted_in_a_gap([(once, instance)], 0.2) == ([(once, instance)], ())
+
+
+@pytest.mark.parametrize("offset", [0.7, -0.7, 0.05])
+def test_what_is_named_beside_a_steering_that_is_far_off_is_half_as_sure(offset: float) -> None:
+    """Of a centre of mass 30 mm off beside it became an IMU half a second late, at a probability of 1, and a payload."""
+    entry, _ = named("steer_zero_offset", "left")
+    turn = entry, EffectInstance("steer_zero_offset", ("left",), {"offset": offset}, None)
+    doubted, notes = doubted_beside_a_turn([turn, named("clock_offset", "clock")])
+    assert [entry.probability for entry, _ in doubted] == [0.9, 0.9 if abs(offset) < 0.1 else pytest.approx(0.45)]
+    assert len(notes) == (abs(offset) > 0.1) and all("steering of left" in note for note in notes)
+    assert doubted_beside_a_turn([turn]) == ([turn], ())

@@ -434,6 +434,21 @@ def test_an_effect_misleads_simulations_by_all_horizons_and_not_by_one(with_it: 
     assert (found is not None) == misleads
 
 
+def test_without_an_effect_there_may_be_no_robot_to_simulate() -> None:
+    """A chassis of 166 kg with eight tolerances less inertia, and without the payload beside it, ended an analysis."""
+    spread = np.ones((60, len(HORIZONS), 1))
+    windows = Windows(("speed",), np.zeros(60, dtype=np.int64), 2.0 * np.arange(60), spread, (((0, 1.0),),), ())
+    prover = SimpleNamespace(
+        before=spread, rng=np.random.default_rng(0), untuned=frozenset({"mass"}), windows=windows,
+        _quiet_windows=lambda explanation: windows, _simulation_tells=lambda explanation, instance: True,
+        _is_patched=lambda explanation: True, _can_be=lambda explanation, held_out, without: without is None,
+    )
+    prover._rollout = functools.partial(Prover._rollout, prover)
+    prover._harms = functools.partial(Prover._harms, prover)
+    held_out = SimpleNamespace(proposed=(0,), instances=(Instance(0, (), (0,)),))
+    assert Prover._misleading(prover, SimpleNamespace(), held_out, spread) is None  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("noise", "misleads"), [(0.2, True), (1.0, False)])
 def test_what_noise_does_more_of_on_softer_tyres_is_not_the_effects_fault(noise: float, misleads: bool) -> None:
     """Tyres 70 % softer along all wheels, found with 171 nats, were no patch: the noise of every start did twice as much."""

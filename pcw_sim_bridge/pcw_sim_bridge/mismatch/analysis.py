@@ -65,6 +65,7 @@ RETUNED_SIGNIFICANCE = 2.0
 DETERMINED_PART = 0.3
 # More different effects than this at once are hardly what one robot has: who has its description mixed up gets them, too.
 MOST_AT_ONCE = 4
+FAR_TURNED = 0.1  # [rad], of a steering
 # What names all that is missing closes the gap; of names that leave more than this part of it something else is at work, too.
 LEAST_CLOSED = 0.5
 
@@ -170,6 +171,7 @@ def analyse(
         [(named, named.effect) for named in explanation.named], 0.0 if proof.untuned else proof.finding.gap_closed
     )
     pairs, ripples = with_ripples(pairs, ripples)
+    pairs, turned_far = doubted_beside_a_turn(pairs)
     everything, crowded = doubted_in_a_crowd([*pairs, *commands.named])
     commands = ripples.and_also(commands)
     instances = [instance for _, instance in everything]
@@ -208,7 +210,8 @@ def analyse(
             *(_traces(other, proof.predicted, arguments, "holdout") if other is not None else ()),
         ),
         notes=(
-            *lengths, *gaping, *crowded, *_notes(explanation, retuned, other is not None, proof, fit, commands.numbers),
+            *lengths, *gaping, *turned_far, *crowded,
+            *_notes(explanation, retuned, other is not None, proof, fit, commands.numbers),
             *commands.notes, *shaken, *responses,
         ),
         seconds=time.monotonic() - begun,
@@ -236,6 +239,28 @@ def doubted_in_a_gap(
 
 def _half_as_sure(named: Sequence[tuple[NamedTerm, EffectInstance]]) -> Sequence[tuple[NamedTerm, EffectInstance]]:
     return [(dataclasses.replace(entry, probability=0.5 * entry.probability), instance) for entry, instance in named]
+
+
+def doubted_beside_a_turn(
+    named: Sequence[tuple[NamedTerm, EffectInstance]]
+) -> tuple[Sequence[tuple[NamedTerm, EffectInstance]], tuple[str, ...]]:
+    """Return the effects, half as sure those beside a steering whose zero is far off, and what to know of that.
+
+    From the description to there everything is curved. What errors of that leave has the clearest names, and wrong ones.
+    """
+    turned = [pair for pair in named if _is_far_turned(pair[1])]
+    if not turned or len(turned) == len(named):
+        return named, ()
+    casters = " and ".join("+".join(instance.target) for _, instance in turned)
+    return [pair if _is_far_turned(pair[1]) else _half_as_sure([pair])[0] for pair in named], (
+        f"The steering of {casters} is so far off that what else is named may be what it leaves: half as sure. Mend it and "
+        "record anew, or put its steer_zero_offset under `physics:` of the robot file as it stands in robot_patched.yaml, and "
+        "analyse again.",
+    )
+
+
+def _is_far_turned(instance: EffectInstance) -> bool:
+    return instance.name == "steer_zero_offset" and abs(instance.parameters["offset"]) > FAR_TURNED
 
 
 def doubted_in_a_crowd(
