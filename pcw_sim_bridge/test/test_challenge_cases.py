@@ -431,6 +431,22 @@ def test_what_torque_commands_alone_show_is_concealed_where_torques_are_commande
     assert controller("drive_coulomb_friction") == "velocity_loops"
 
 
+def test_an_actuator_is_as_large_as_what_it_makes_of_its_commands() -> None:
+    """Of two runs all that slips otherwise counted: a lag within a cycle, which re-tuning explains, was 18 floors large."""
+
+    def sizes(controller: str, *times: float) -> list[effect_size.EffectSize]:
+        own = world(controller=controller)
+        channels = HealthyChannels(own.nominal, [simulate(own, RUN, ())], [simulate(own.quiet(), RUN, ())])
+        lags = [[effect_instance("actuator_lag", ("rear_left",), {"time_constant": time}, "steer")] for time in times]
+        return [channels.size([simulate(own.quiet(), RUN, lag)], lag) for lag in lags]
+
+    large, small = sizes("computed_torque", 0.02, 0.0005)
+    [unseen] = sizes("velocity_loops", 0.02)
+    assert large.channel == "command_tracking/rear_left_steer" and large.size > 3.0 and large.evidence > 1000.0
+    assert small.size < 0.2 and small.evidence < 18.0
+    assert (unseen.size, unseen.evidence) == (0.0, 0.0)
+
+
 def test_one_way_of_tyres_is_not_hidden_by_making_another_effect_of_it() -> None:
     """In a description in which all tyres are seven times stiffer, tyres softer along are right, and those across are not."""
     orders = order_cases(16, 2, kinds=("masked",), plants=("reduced",), durations=(15.0, 16.0))

@@ -167,6 +167,24 @@ def test_an_accelerometer_may_be_read_in_step_with_drives_that_hold_speeds(tmp_p
     assert list(found.values()) == pytest.approx([50.0 * cycle / math.sqrt(3.0)] * len(found), rel=0.01)
 
 
+@pytest.mark.parametrize("controller", ["velocity_loops", "computed_torque"])
+def test_what_drives_do_not_report_while_a_caster_flips_is_no_finding(tmp_path: Path, controller: str) -> None:
+    """Of 5 % of the samples a healthy robot that strafed to and fro was told of a torque by all steerings and its speed."""
+    recording = Recording.open(run(FLOW_BASE, controller, tmp_path, "strafe", 29.0), FLOW_BASE)
+    problem = RobotProblemBuilder(FLOW_BASE, [recording], CUTOFF).build(with_terms=False)
+    assert problem.misjudged is not None
+    steering = np.stack([problem.variables[f"steer_velocity/{name}"] for name in FLOW_BASE.caster_names], axis=1)
+    fastest, valid = np.abs(steering).max(axis=1), problem.valid[:, FORCES].all(axis=1)
+    flips, rolls = valid & (fastest > 6.0), valid & (fastest < 0.2)
+    assert flips.sum() > 5 and rolls.sum() > 100
+    in_flips, rolling = (np.sqrt(np.mean(problem.misjudged[rows, FORCES] ** 2, axis=0)) for rows in (flips, rolls))
+    print(in_flips, rolling)
+    if controller == "velocity_loops":
+        assert np.all(in_flips > 5.0 * rolling)
+    else:
+        assert not problem.misjudged[:, FORCES].any()
+
+
 def test_no_factor_of_all_torques_and_masses_takes_errors_away(tmp_path: Path) -> None:
     """Of the errors of a robot that obeys its commands half were weaker motors of a lighter robot."""
     robot = load_robot("tidybot2")

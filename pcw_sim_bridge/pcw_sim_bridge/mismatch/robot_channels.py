@@ -43,9 +43,11 @@ from .robot_effects import ChannelModel, true_motion, with_leads, with_pose
 from .robot_motion import SHORTEST_SEGMENT, RobotMotion, choose_cutoff, has_balance, has_torques, read_motions
 from .robot_nuisances import (
     FLOOR,
+    LOOP_BANDWIDTH,
     MODEL_DEVIATION,
     VariedNumber,
     floor_nuisances,
+    largest_part,
     robot_nuisances,
     varied_numbers,
 )
@@ -348,7 +350,8 @@ class RobotProblemBuilder:
     def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
         """What the model misjudges in each sample (T, C): slips, by a part of those there are, and what an IMU leans.
 
-        Besides what joints lose where their dry friction reverses, and what encoders do not resolve.
+        Besides what joints lose where their dry friction reverses, what encoders do not resolve, and what drives that hold
+        speeds do not report while what accelerates their joints changes: a caster that flips is accelerated anew every moment.
         """
         found, predicted = np.zeros_like(differences.predicted), differences.predicted
         lost = [motion.lost for motion in differences.motions if motion.lost is not None]
@@ -361,9 +364,15 @@ class RobotProblemBuilder:
             found[:, self.layout.consistency] = np.hypot(misjudged, unknown)
         if self.layout.imu:
             found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
-        if lost:
-            doubts = [by_joint(own.doubt.reshape(len(own.doubt), -1, 1)) for own in lost]
-            found = np.sqrt(found**2 + np.sum(differences.of_torque(doubts) ** 2, axis=2))
+        doubts = [own.doubt for own in lost]
+        if self.layout.balanced and any(np.any(motion.loops) for motion in differences.motions):
+            # What a report lacks lags behind what accelerates its joint, by about as long as the loop takes.
+            part = largest_part(differences.motions) / LOOP_BANDWIDTH
+            loops = [part * derivative(motion.loops[..., 0], motion.rate) for motion in differences.motions]
+            doubts = [np.hypot(own, more) for own, more in zip(doubts, loops, strict=True)] if lost else loops
+        if doubts:
+            each = [by_joint(own.reshape(len(own), -1, 1)) for own in doubts]
+            found = np.sqrt(found**2 + np.sum(differences.of_torque(each) ** 2, axis=2))
         return found
 
     def _unresolved(self) -> FloatArray:

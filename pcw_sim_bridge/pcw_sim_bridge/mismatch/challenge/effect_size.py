@@ -5,7 +5,8 @@
 The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. Both residuals are of
 one run. A run without the effect is another motion as soon as wheels slip a little otherwise, and of two motions all that is
 within tolerances is different, too: an effect a thousand times too small to be seen was 27 floors large. Only what no
-description holds (actuators and gears; torques by other joints or by time) is held against the same run without it.
+description holds (gears; torques by other joints or by time) is held against the same run without it. What actuators do to
+their commands is no motion: see `command_size`.
 
 An effect may be large and yet be no more than re-tuning within tolerances explains. `evidence` says what the run costs more
 with the effect than without it, and than the same run against a description that holds it [nats], each re-tuned by itself:
@@ -34,6 +35,7 @@ from ..errors import MismatchError
 from ..noise_model import fit_noise_model, huber_weights
 from ..regression_problem import BoolArray, FloatArray, RegressionProblem
 from ..robot_channels import RobotProblemBuilder
+from .command_size import command_size, shows_in_commands
 from .healthy_deviations import tolerated_cost
 from .simulated_case import SimulatedRecording, known_while_simulated
 
@@ -79,7 +81,7 @@ class HealthyChannels:
 
         Two noisy runs that differ in nothing but a small number read other counts of their encoders, and differ by that.
         """
-        self._nominal = nominal
+        self._nominal, self._recordings = nominal, recordings
         builder = RobotProblemBuilder(nominal, list(recordings))  # type: ignore[arg-type]
         self._cutoff = builder.cutoff
         self.problem = builder.build(with_terms=False)
@@ -111,19 +113,25 @@ class HealthyChannels:
         largest = int(np.argmax(relative))
         (cost, moved), described = self._costs(with_effect, holding)
         _, healthy_moved = self._healthy_cost
+        retuned = {n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)}
+        if shows_in_commands(effects):
+            commanded = command_size(self._nominal, self._recordings, recordings, effects)
+            return EffectSize(commanded.size, commanded.channel, commanded.evidence, {}, retuned)
         active = np.any(rows & (np.abs(change) > self.floor), axis=1)
         return EffectSize(
             size=float(relative[largest]),
             channel=problem.channels[largest].name,
             evidence=_evidence(self._nominal, cost - described, effects),
             region=_regions(along, active),
-            retuned={n.name: float(v) for n, v in zip(problem.nuisances, moved - healthy_moved, strict=True)},
+            retuned=retuned,
         )
 
     def evidence(
         self, nominal: RobotDescription, recordings: Sequence[SimulatedRecording], effects: Sequence[EffectInstance] = ()
     ) -> float:
         """The evidence of effects in these runs against another description [nats], see above."""
+        if shows_in_commands(effects):
+            return command_size(nominal, self._recordings, recordings, effects).evidence
         holding = self._holding(nominal, recordings, effects)
         (cost, _), described = self._costs(_build(nominal, recordings, self._cutoff), holding)
         return _evidence(nominal, cost - described, effects)
