@@ -32,6 +32,9 @@ def on_its_wheels(robot):
         wheel.add_geom(
             type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[radius, 0.2 * radius, radius], contype=1, conaffinity=0, **touching
         )
+    place = spec.body("base_link").add_site(name="imu", pos=robot.sensors.imu.position)
+    for kind in (mujoco.mjtSensor.mjSENS_GYRO, mujoco.mjtSensor.mjSENS_ACCELEROMETER):
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=place.name)
     spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return spec.compile()
 
@@ -62,21 +65,21 @@ def recorded(robot, friction, seed=0):
             torque = np.clip(gains[0] * error + integral, -robot.torque_limit, robot.torque_limit)
             w, z = data.qpos[3], data.qpos[6]
             pose = [*data.qpos[:2], 2.0 * math.atan2(z, w)]
-            rows.append((k * STEP, read, rate, torque, pose, data.qvel[5]))
+            rows.append((k * STEP, read, rate, torque, pose, data.sensordata.copy()))
         data.qfrc_applied[rates] = torque - friction * np.tanh(data.qvel[rates] / 0.03)
         mujoco.mj_step(model, data)
-    time, position, velocity, effort, pose, turned = (np.array(column) for column in zip(*rows, strict=True))
+    time, position, velocity, effort, pose, sensed = (np.array(column) for column in zip(*rows, strict=True))
     stamps = time, (1e9 * time).astype(np.int64)
     names = tuple(robot.joint_names)
     noisy = effort + 0.02 * rng.standard_normal(effort.shape)
     pose[:, 2] = np.unwrap(pose[:, 2])
-    gyro = np.zeros((len(time), 3))
-    gyro[:, 2] = turned + 0.002 * rng.standard_normal(len(time))
+    gyro = sensed[:, :3] + 0.002 * rng.standard_normal((len(time), 3))
+    acceleration = sensed[:, 3:] + 0.02 * rng.standard_normal((len(time), 3))
     tracked = pose + 5e-4 * rng.standard_normal(pose.shape)
     return SimulatedRecording(
         Path("mujoco"), robot, JointSeries(*stamps, names, position, velocity, noisy),
         JointSeries(*stamps, names, *(np.full_like(effort, np.nan) for _ in range(2)), effort),
-        ImuSeries(*stamps, gyro, np.full_like(gyro, np.nan)),
+        ImuSeries(*stamps, gyro, acceleration),
         OdometrySeries(*stamps, tracked, np.full_like(tracked, np.nan), "odom", "base_link"), None,
     )  # fmt: skip
 
@@ -88,8 +91,9 @@ def explained(friction, seed):
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_a_robot_as_it_is_described_misses_nothing(seed):
-    """What its soft contacts do was a law outside the library."""
+    """What its soft contacts do was a law outside the library; its own gyro and accelerometer feel what they should."""
     found = explained(np.zeros((THESIS.n, 2)), seed)
+    assert {"gyro", "accelerometer/x", "accelerometer/y"} <= {channel.name for channel in found.search.problem.channels}
     assert not found.named and not found.leftovers
 
 
