@@ -24,7 +24,7 @@ import numpy as np
 
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
-from .leftover_expression import plain_forms
+from .leftover_expression import closed_form, plain_forms
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
 from .regression_problem import UNKNOWN, FloatArray, RegressionProblem, Term
@@ -41,6 +41,8 @@ SCREENING_CORRELATION = 5.0
 # Means of at most so many stretches are screened, none longer than this [s]: laws are slow, and the noise of forces is not.
 SCREENED_STRETCHES, LONGEST_STRETCH = 400, 0.3
 FINALISTS = 10
+NEARLY_ALIKE = 15.0  # nats of the best law, within which others are held against it by their closed forms, too
+BY_CHANNEL = 40  # laws, the best at a first look, whose gain is taken channel by channel
 FOLDS = 5
 # A law must move some channel by this part of the rms that it leaves there, and by this part of the measured side.
 SMALLEST_SHARE, SMALLEST_PART = 0.35, 0.03
@@ -134,18 +136,31 @@ class LawSearch:
         residual = self._left_by(trials[int(np.argmax(evidences))])
         trials = on_all_cores(lambda trial: self._pruned(residual, trial), trials)
         fits = on_all_cores(lambda trial: trial.search.whiten_at(residual).fit(trial.instances), trials)
-        order = np.argsort([-fit.log_evidence for fit in fits])
+        # Where speeds go together curves of any two of them do alike: a law of few numbers has them for a reason.
+        best = max(fit.log_evidence for fit in fits)
+        near = [k for k, fit in enumerate(fits) if fit.log_evidence > best - NEARLY_ALIKE]
+        simple = {k: self._evidence_of_a_closed_form(residual, trials[k], fits[k]) for k in near} if len(near) > 1 else {}
+        order = np.argsort([-max(fit.log_evidence, simple.get(k, -math.inf)) for k, fit in enumerate(fits)])
         weights = [fits[k].mean[-len(trial.instance.active) :] for k, trial in enumerate(trials)]
         ranked = [trials[k] for k in order if not self._undoes_a_motor(trials[k].law, weights[k])]
         if not ranked:
             return None
-        best = self._judged(ranked[0])
-        if best.counts:
-            return best
+        found = self._judged(ranked[0])
+        if found.counts:
+            return found
         # What fits best may do so beside the names, as a detail; another may still be what a name stands for.
         rivals = [self._judged(trial) for trial in ranked[1:] if len(trial.names) < len(self.names)]
         doubts = [rival for rival in rivals if rival.withdrawn]
-        return min([best, *doubts], key=lambda found: (not found.counts, found.belief if found.withdrawn else 1.0))
+        return min([found, *doubts], key=lambda one: (not one.counts, one.belief if one.withdrawn else 1.0))
+
+    def _evidence_of_a_closed_form(self, residual: FloatArray, trial: _Trial, fit: Fit) -> float:
+        """Evidence of the closed form that comes nearest to a law's curve, under the noise of a residual (T, C)."""
+        own = slice(-len(trial.instance.active), None)
+        form = closed_form(trial.law.basis, fit.mean[own], fit.covariance[own, own])
+        if form is None:
+            return -math.inf
+        simple = self._trial(dataclasses.replace(trial.law, basis=form), trial.names)
+        return float(simple.search.whiten_at(residual).fit(simple.instances).log_evidence)
 
     def _undoes_a_motor(self, law: Law, weights: FloatArray) -> bool:
         """Whether a law with weights (K,) takes away most of the motor's torque of which it is a function."""
@@ -439,7 +454,7 @@ class _Screened:
         count.
         """
         self.total, self.rows, self._weight = total, rows, weight
-        self._bases = {key: base * weight for key, base in bases.items()}
+        self._plain, self._bases = bases, {key: base * weight for key, base in bases.items()}
         self._known, self._target = known.reshape(*weight.shape, -1), target.reshape(weight.shape)
         self._own: dict[_Base, tuple[FloatArray, FloatArray]] = {}
         self._pairs: dict[tuple[_Base, _Base], FloatArray] = {}
@@ -462,6 +477,21 @@ class _Screened:
                     self._pairs[key, other] = np.sum(self._bases[key] * self._bases[other], axis=1)
                 plain += own.T @ (self._pairs[key, other][:, None] * others)
         return plain, cross, moment
+
+    def plain(self, site: str, factor: Factor) -> FloatArray:
+        """The column (S, C) of a site, not weighed."""
+        return self._plain[site, factor]
+
+    def gain_by_channel(self, columns: FloatArray, weights: FloatArray) -> float:
+        """Nats by which columns (S, C, F) with weights (F,) make every channel's own square less."""
+        own = ((columns @ weights) * self._weight).ravel()
+        known = self._known.reshape(len(own), -1)
+        left = self._target - (own - known @ (known.T @ own)).reshape(self._target.shape)
+        before, after = (np.sum(values**2, axis=0) for values in (self._target, left))
+        seen = before > 0.0
+        judged = np.sum(self._weight > 0.0, axis=0)
+        rows = self.rows * judged[seen] / max(float(judged.sum()), 1.0)
+        return float(0.5 * np.sum(rows * np.log(before[seen] / np.maximum(after[seen], 1e-6 * before[seen]))))
 
     def products_of(self, columns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the same of whole columns (S, C, F)."""
@@ -511,7 +541,20 @@ class _Screen:
             explained = min(float(moment @ weights), 0.999999 * screened.total)
             gain = -0.5 * screened.rows * np.log1p(-explained / screened.total)
             scores.append((float(gain - 0.5 * len(moment) * np.log(screened.rows)), weights))
+        # What explains nearly all of one channel is little of all channels together; what noise there is in it shows then.
+        for k in sorted(range(len(scores)), key=lambda k: -scores[k][0])[:BY_CHANNEL]:
+            gain, weights = scores[k]
+            own = screened.gain_by_channel(self._columns(self.laws[k], screened), weights)
+            scores[k] = max(gain, float(own - 0.5 * len(weights) * np.log(screened.rows))), weights
         return scores
+
+    def _columns(self, law: Law, screened: _Screened) -> FloatArray:
+        """Columns (S, C, F) of a law, not weighed."""
+        if law in self._exact:
+            return self._exact[law]
+        return np.sum(
+            [screened.plain(p.site, p.factor)[:, :, None] * (p.weight * self._of(law, p))[:, None] for p in law.places], axis=0
+        )
 
     def _beside(self, instances: tuple[Instance, ...]) -> tuple[FloatArray, FloatArray, FloatArray, float, float]:
         """Weights, what tolerances and set span, what they leave, its square, and independent rows, for one set."""

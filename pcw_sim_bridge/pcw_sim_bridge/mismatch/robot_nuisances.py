@@ -199,8 +199,8 @@ def _gain(index: int, axis: int) -> Vary:
 def _suspension(differences: ChannelDifferences) -> list[VariedNumber]:
     """How far the chassis leans on its springs when it accelerates: anything between not at all and twice as described.
 
-    And how fast: springs, dampers and inertias about level axes are seldom measured. What an IMU feels of that is a number of
-    its own: it may stand elsewhere on a frame that gives way, or its driver may have taken gravity out.
+    And how fast: springs, dampers and inertias about level axes are seldom measured. What an IMU feels of its weight then is a
+    number of its own: it may stand elsewhere on a frame that gives way, or its driver may have taken gravity out.
     """
     layout, numbers = differences.model.layout, differences.model.numbers
     if layout.lifted or not (layout.balanced or layout.imu):

@@ -244,8 +244,7 @@ class ModelNumbers:
         spring: of the chassis over each wheel [N/m].
         lean: how far the centre of mass stays behind where a rigid body would have it, per acceleration along x and y, as the
             chassis leans on its springs (2,) [s^2]; detuning: how much more of it there is per relative change of the
-            frequencies of `sway`, times that change (2,) [s^2]; imu_lean: how far it does by what an IMU feels of its weight
-            and of its own swinging (2,) [s^2].
+            frequencies of `sway`, times that change (2,) [s^2]; imu_lean: how far it does by what an IMU feels (2,) [s^2].
         sway: frequencies and damping of that. A chassis that leans when it accelerates does so too where its wheels do not
             carry it at its centre of mass.
     """
@@ -948,16 +947,19 @@ def channel_sides(
         rate = numbers.gyro_scale * omega + numbers.gyro_bias
         along = twist_dot[:, 0] - omega * twist[:, 1] - alpha * y - omega**2 * x
         across = twist_dot[:, 1] + omega * twist[:, 0] + alpha * x - omega**2 * y
-        tilt = numbers.sway.response(wheels.standing, motion.rate) if wheels.standing.any() else wheels.standing
-        if numbers.imu_lean.any():
-            leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
-            tilt = tilt + _tilt(numbers, leaning, numbers.imu_lean, wheels.direction)
+        standing = numbers.sway.response(wheels.standing, motion.rate) if wheels.standing.any() else wheels.standing
+        tilt = standing if leaning is None else standing + leaning / numbers.height_of_mass
         if tilt.any():
-            # A sensor that leans feels a part of its weight, and the higher it stands, the farther it swings with the chassis.
-            thrown = GRAVITY * tilt - numbers.imu_height * derivative(derivative(tilt, motion.rate), motion.rate)
+            # The higher a sensor stands, the farther it swings with the chassis.
+            swinging = numbers.imu_height * derivative(derivative(tilt, motion.rate), motion.rate)
+            # And as it leans with it, it feels a part of its weight.
+            thrown = GRAVITY * standing - swinging
             along, across = along + thrown[:, 0], across + thrown[:, 1]
         felt = numbers.accelerometer_scale * np.stack([along, across], axis=1) + numbers.accelerometer_bias
         sensed = np.concatenate([rate[:, None], felt], axis=1)
+        if numbers.imu_lean.any():
+            leaning = numbers.imu_lean * numbers.sway.response(acceleration_of(twist, twist_dot), motion.rate)
+            sensed[:, 1:] += GRAVITY * _tilt(numbers, leaning, numbers.imu_lean, wheels.direction)
         predicted.append(sensed)
     if layout.pose:
         late = numbers.clock[1] * derivative(motion.tracked_twist, motion.rate) if numbers.clock[1] else 0.0
