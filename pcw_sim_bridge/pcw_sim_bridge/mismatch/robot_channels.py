@@ -47,7 +47,7 @@ from .robot_nuisances import (
     MODEL_DEVIATION,
     VariedNumber,
     floor_nuisances,
-    largest_part,
+    largest_unreported_part,
     robot_nuisances,
     varied_numbers,
 )
@@ -367,7 +367,7 @@ class RobotProblemBuilder:
         doubts = [own.doubt for own in lost]
         if self.layout.balanced and any(np.any(motion.loops) for motion in differences.motions):
             # What a report lacks lags behind what accelerates its joint, by about as long as the loop takes.
-            part = largest_part(differences.motions) / LOOP_BANDWIDTH
+            part = largest_unreported_part(differences.motions) / LOOP_BANDWIDTH
             loops = [part * derivative(motion.loops[..., 0], motion.rate) for motion in differences.motions]
             doubts = [np.hypot(own, more) for own, more in zip(doubts, loops, strict=True)] if lost else loops
         if doubts:

@@ -228,7 +228,7 @@ def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
     motions = [motion for motion in differences.motions if np.any(motion.loops)]
     if not motions:
         return
-    part = largest_part(motions)
+    part = largest_unreported_part(motions)
     behind = any(np.any(motion.loops[..., 1]) for motion in motions)
     layout = differences.model.layout
     owners: Mapping[str, int | slice] = {"": slice(None)}
@@ -242,7 +242,7 @@ def _unreported(differences: ChannelDifferences) -> Iterator[VariedNumber]:
                 yield VariedNumber(label, "1/s", 0.0, deviation, _entry("unreported", (own, axis, 1)))
 
 
-def largest_part(motions: Sequence[RobotMotion]) -> float:
+def largest_unreported_part(motions: Sequence[RobotMotion]) -> float:
     """How far what accelerates a joint whose drive holds speeds strays from its mean within a cycle, relative."""
     return min(LOOP_BANDWIDTH * max(motion.sampling for motion in motions), LARGEST_UNREPORTED)
 
@@ -255,7 +255,7 @@ def _within_cycle(differences: ChannelDifferences) -> Iterator[VariedNumber]:
     """
     motions = [motion for motion in differences.motions if np.any(motion.loops)]
     for k, axis in enumerate("xy" if motions else ""):
-        deviation = largest_part(motions) / math.sqrt(3.0)
+        deviation = largest_unreported_part(motions) / math.sqrt(3.0)
         yield VariedNumber(f"imu.report.{axis}", "1", 0.0, deviation, _entry("accelerometer_scale", k))
 
 
