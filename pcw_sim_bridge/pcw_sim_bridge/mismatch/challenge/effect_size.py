@@ -4,9 +4,9 @@
 
 The noise floor of a channel is the rms of the healthy run's residual after re-tuning within tolerances. Both residuals are of
 one run. A run without the effect is another motion as soon as wheels slip a little otherwise, and of two motions all that is
-within tolerances is different, too: an effect a thousand times too small to be seen was 27 floors large. Only what no
-description holds (gears; torques by other joints or by time) is held against the same run without it. What actuators do to
-their commands is no motion: see `command_size`.
+within tolerances is different, too: an effect a thousand times too small to be seen was 27 floors large, a play of two
+millionths of a radian 110. Only what no description holds (torques by other joints or by time) is held against the same run
+without it. What actuators do to their commands is no motion: see `command_size`.
 
 An effect may be large and yet be no more than re-tuning within tolerances explains. `evidence` says what the run costs more
 with the effect than without it, and than the same run against a description that holds it [nats], each re-tuned by itself:
@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
-from pcw_description.effects.kinds import ActuatorEffect, TransmissionEffect
+from pcw_description.effects.kinds import ActuatorEffect
 from pcw_description.effects.registry import all_effects
 from pcw_description.robot_description import STEER, RobotDescription
 
@@ -247,13 +247,13 @@ def _evidence(robot: RobotDescription, costs_more: float, effects: Sequence[Effe
 
 
 def _in_channels(instance: EffectInstance) -> bool:
-    """Whether the channels of a description that holds the effect are exact.
+    """Whether the channels of a description that holds the effect show what it does.
 
-    What comes before the measured torque is not in them; gears that play or give are, to first order; torques by other joints
-    or by time are in no description.
+    What comes before the measured torque is not in them; torques by other joints or by time are in no description. Of gears
+    that play or give they hold the first order, which is nearer than another motion.
     """
     effect = all_effects().get(instance.name)
-    return effect is not None and not isinstance(effect, ActuatorEffect | TransmissionEffect)
+    return effect is not None and not isinstance(effect, ActuatorEffect)
 
 
 def _headings(recording: SimulatedRecording) -> FloatArray:
