@@ -163,9 +163,12 @@ class EffectGates:
         """Nats beside the model's own errors from which a contribution is none of them."""
         if all(self._at_joints(instance) for instance in instances):
             return self.settings.least_peculiar_unlike
-        unlike = all(self._at_joints(i) or self.problem.terms[i.term].unlike_errors for i in instances)
-        least = self.settings.least_peculiar_unlike if unlike else self.settings.least_peculiar
-        return least * self._noise_factor(instances)
+        terms = [self.problem.terms[instance.term] for instance in instances]
+        if all(term.at_joints or term.unlike_errors for term in terms):
+            return self.settings.least_peculiar_unlike * self._noise_factor(instances)
+        # One gear that winds up does to one wheel what no error of the model does to one alone.
+        one_gear = all(term.axis is not None and len(term.target) == 1 for term in terms)
+        return self.settings.least_peculiar * (1.0 if one_gear else self._noise_factor(instances))
 
     def _at_joints(self, instance: Instance) -> bool:
         """Whether an effect of the library adds torques to joints, in proportion to its numbers."""
