@@ -516,6 +516,7 @@ def test_what_a_kernel_does_not_see_is_no_file(law, reason):
         (lambda z: -0.02 * z**3, Basis("speed", KNOTS, 0.05), ["z**3"]),
         (lambda z: 1.0 - np.exp(-z / 7.0), Basis("map", (tuple(np.linspace(0.0, 40.0, 8)),)), ["1.0", "exp(-z / "]),
         (lambda z: 0.5 * np.sin(2.0 * z), Basis("periodic", ((-np.pi, np.pi),)), ["sin(2 * z)"]),
+        (lambda z: -0.6 * np.abs(z), Basis("map", (tuple(np.linspace(-1.5, 1.0, 8)),)), ["abs(z)"]),
     ],
 )
 def test_a_curve_that_has_a_closed_form_gets_it(function, basis, text):

@@ -9,8 +9,8 @@ A law counts if it beats the names, refined as far as they can be, by evidence a
 prediction by a part that matters. A name that it makes redundant is withdrawn, unless the name alone does most of what
 the law does: friction that varies by a tenth with the steering angle is friction and a leftover. If the best law does not
 count, every other one that could stand for a name is judged, too: beside a name a law must be large to be told of, in its
-place it is expected as small as the name is. So are plain functions of a name's own speed, each alone in its place: what a
-small drag leaves beside a viscous friction is too little to be found.
+place it is expected as small as the name is. So are plain functions of a name's own speed or torque, each alone in its
+place: what a small drag leaves beside a viscous friction is too little to be found.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pcw_description.effects.registry import all_effects
+
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
-from .leftover_expression import closed_form, plain_forms
+from .leftover_expression import ClosedForm, closed_form, plain_forms
 from .noise_model import huber_weights, robust_deviation
 from .place_waves import place_waves
 from .regression_problem import UNKNOWN, FloatArray, RegressionProblem, Term
@@ -36,6 +38,9 @@ _Base = tuple[str, Factor]
 LAW_MARGIN = 15.0
 # Logarithm of their number: what the best of them gains for having been chosen.
 HYPOTHESES_COST = 8.0
+# The same of plain functions in place of a name: there are few, of as many numbers as the name. In place of names that are
+# right none came nearer than 12 nats less.
+PLAIN_MARGIN, PLAIN_COST = 5.0, 2.0
 # Samples of a channel count as so many fewer in the screening, where the colour of the noise is not looked at.
 SCREENING_CORRELATION = 5.0
 # Means of at most so many stretches are screened, none longer than this [s]: laws are slow, and the noise of forces is not.
@@ -74,6 +79,7 @@ class FoundLaw:
         counts: whether it is sure enough to be told. If not, it is a doubt about the names that it would withdraw.
         alike: whether the names that it would withdraw do most of what it does.
         apart: by which part of what these names do the law differs from them, where they are clearest.
+        cost: logarithm of how many laws it was chosen from.
     """
 
     law: Law
@@ -85,6 +91,7 @@ class FoundLaw:
     counts: bool
     alike: bool
     apart: float
+    cost: float = HYPOTHESES_COST
 
     @property
     def belief(self) -> float:
@@ -93,7 +100,7 @@ class FoundLaw:
         Half of it where name and law explain nearly the same: then details of the model decide between them. Most of it where
         they are the same but for a trifle.
         """
-        odds = math.exp(min(min(self.gain, self.held_out) - HYPOTHESES_COST, 50.0))
+        odds = math.exp(min(min(self.gain, self.held_out) - self.cost, 50.0))
         least = (MOST if self.apart < TRIFLE else 0.5) if self.alike else 0.0
         return max(1.0 / (1.0 + odds), least)
 
@@ -168,7 +175,7 @@ class LawSearch:
         assert sites is not None
         torques: FloatArray | None = None
         for index, site in enumerate(sites.names):
-            motor = "force" if site == "axis_force" else site
+            motor = _own(site, "torque")
             if site not in law.sites or motor not in law.depends_on:
                 continue
             torques = law.torques(sites) if torques is None else torques
@@ -210,17 +217,27 @@ class LawSearch:
         return _Trial(law, search, names, Instance(len(problem.terms) - 1, (), everything))
 
     def _in_place_of_names(self) -> list[_Trial]:
-        """Plain functions of the joints' own speeds, each without the names of one effect that are functions of just these."""
+        """Plain functions of the joints' own speeds, or torques, each without the names of one effect that it may stand for.
+
+        Those of speeds stand for functions of just these: a drag for a friction. Those of torques stand for all that these
+        lose, and for what is lost beside them: a motor that gives less one way for a gear that rubs, or for a load.
+        """
         assert self.problem.sites is not None
         terms = {name: self.problem.terms[name.term] for name in self.names}
         terms = {name: term for name, term in terms.items() if term.effect != UNKNOWN}
+        torques = {_own(site, "torque") for site in self.problem.sites.names}
         trials = []
         for law in hypotheses(self.problem.sites) if terms else ():
-            if law.basis.kind != "speed" or any(p.factor != Factor() or p.arguments != _own_speed(p.site) for p in law.places):
+            of_torque = all(place.arguments == _alone(_own(place.site, "torque")) for place in law.places)
+            of_speed = all(place.arguments == _alone(_own(place.site, "velocity")) for place in law.places)
+            free = all(place.factor == Factor() for place in law.places)
+            if not free or not (of_torque or of_speed and law.basis.kind == "speed"):
                 continue
             for effect in dict.fromkeys(term.effect for term in terms.values()):
-                own = {i: set(t.arguments) for i, t in terms.items() if t.effect == effect and t.arguments}
-                replaced = {i for i, arguments in own.items() if arguments <= set(law.depends_on)}
+                own = {i: set(t.arguments) for i, t in terms.items() if t.effect == effect}
+                if of_torque:
+                    own = {i: (arguments or _beside(terms[i])) & torques for i, arguments in own.items()}
+                replaced = {i for i, arguments in own.items() if arguments and arguments <= set(law.depends_on)}
                 if replaced and set.union(*(own[i] for i in replaced)) == set(law.depends_on):
                     others = tuple(name for name in self.names if name not in replaced)
                     trials += [self._trial(plain, others) for plain in plain_forms(law)]
@@ -276,7 +293,8 @@ class LawSearch:
         dropped = tuple(i for i, replace in zip(self.names, replaced, strict=True) if replace)
         if dropped or not self.names:
             gain += gain_of_a_smaller_law(regression, trial.instances)
-        sure = min(gain, held_out) >= (LAW_MARGIN if dropped else self.threshold)
+        margin, cost = (PLAIN_MARGIN, PLAIN_COST) if isinstance(trial.law.basis, ClosedForm) else (LAW_MARGIN, HYPOTHESES_COST)
+        sure = min(gain, held_out) >= (margin if dropped else self.threshold)
         counts = sure and self._matters(problem, trial.law, with_law, without, replaced)
         both = max(scores[2] - scores[0], 1e-300)
         names, withdrawn = tuple(i for i in self.names if i not in dropped), dropped
@@ -289,7 +307,7 @@ class LawSearch:
             trial.law, gain, held_out, min(both / max(scores[2], 1e-300), 1.0),
             tuple(plain[i.term] if i.term in plain else i for i in names),
             tuple(plain[i.term] if i.term in plain else i for i in withdrawn), counts, alike,
-            self._apart(problem, with_law, without, replaced),
+            self._apart(problem, with_law, without, replaced), cost,
         )
 
     def _apart(self, problem: RegressionProblem, with_law: Fit, without: Fit, dropped: Sequence[bool]) -> float:
@@ -360,9 +378,22 @@ def _part_of(problem: RegressionProblem, fit: Fit, which: Sequence[bool]) -> Flo
     return does
 
 
-def _own_speed(site: str) -> tuple[Combination, ...]:
-    """The speed of a site's own joint as the arguments of a law."""
-    return (((("velocity" if site == "axis_force" else site.replace("torque", "velocity")), 1.0),),)
+def _own(site: str, kind: str) -> str:
+    """The variable that is a site's own "torque" or "velocity"."""
+    if site == "axis_force":
+        return "force" if kind == "torque" else kind
+    return site.replace("torque", kind)
+
+
+def _beside(term: Term) -> set[str]:
+    """The torques of the motors beside which an effect acts on joints."""
+    axis = term.axis or all_effects()[term.effect].axis
+    return {f"{axis}_torque/{name}" for name in term.target} if term.at_joints else set()
+
+
+def _alone(variable: str) -> tuple[Combination, ...]:
+    """A variable as the only argument of a law."""
+    return (((variable, 1.0),),)
 
 
 def _is_fast(law: Law) -> bool:

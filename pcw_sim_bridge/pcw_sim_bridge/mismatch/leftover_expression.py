@@ -55,6 +55,7 @@ def _steps(low: float, high: float) -> list[tuple[float, ...]]:
 ONE = Shape("1.0", "0.0")
 LINEAR, SQUARE = Shape("z", "1.0"), Shape("z**2", "2.0 * z")
 CUBE = Shape("z**3", "3.0 * z**2")
+ABS = Shape("abs(z)", "z / (abs(z) + 1e-12)")
 DRAG, SIGN = Shape("abs(z) * z", "2.0 * abs(z)"), Shape("tanh(z / {0})", "(1.0 - tanh(z / {0})**2) / {0}")
 FADE = Shape("exp(-z / {0})", "-exp(-z / {0}) / {0}", _times)
 STEP = Shape("tanh((z - {0}) / {1})", "(1.0 - tanh((z - {0}) / {1})**2) / {1}", _steps)
@@ -113,7 +114,7 @@ def plain_expression(name: str, values: FloatArray, curve: FloatArray, periodic:
     least = ALIKE_ENOUGH * float(np.sum((curve - curve.mean()) ** 2))
     if least <= 0.0:
         return None
-    plain = ((LINEAR,), (Shape("abs(z)", ""),), (SQUARE,), (DRAG,), (CUBE,), (LINEAR, SQUARE), (LINEAR, CUBE))
+    plain = ((LINEAR,), (ABS,), (SQUARE,), (DRAG,), (CUBE,), (LINEAR, SQUARE), (LINEAR, CUBE))
     for shapes in ((Shape("cos(z)", ""), Shape("sin(z)", "")),) if periodic else plain:
         columns = np.stack([Atom(shape).values(values) for shape in shapes], axis=1)
         columns = columns - columns.mean(axis=0)
@@ -130,11 +131,11 @@ def fourier(basis: Basis) -> ClosedForm:
 
 
 def plain_forms(law: Law) -> list[Law]:
-    """Return a law of one speed with each of the plain functions in place of its curve that no effect of the library is."""
+    """Return a law of one speed or torque with each of the plain functions in its place that no effect of the library is."""
     basis = law.basis
     return [
         dataclasses.replace(law, basis=ClosedForm("closed", basis.knots, basis.width, atoms=(Atom(shape),), clipped=False))
-        for shape in (SQUARE, CUBE, DRAG)
+        for shape in ((SQUARE, CUBE, DRAG) if basis.kind == "speed" else (ABS,))
     ]
 
 
@@ -197,6 +198,8 @@ def _groups(basis: Basis, low: float, high: float) -> list[tuple[Atom, ...]]:
     groups: list[tuple[Atom, ...]] = [(Atom(LINEAR),), (Atom(SQUARE),), (Atom(CUBE),)]
     if basis.kind == "speed":
         return [*groups, (Atom(DRAG),), (Atom(SIGN, (basis.width,)),)]
+    if low < 0.0 < high:
+        groups.append((Atom(ABS),))
     for shape in (FADE, STEP, BUMP):
         groups += [(Atom(shape, inner),) for inner in shape.starts(low, high)]
     groups += [(Atom(COS, inner), Atom(SIN, inner)) for inner in _waves(low, high)]
