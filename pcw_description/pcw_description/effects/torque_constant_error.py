@@ -20,7 +20,7 @@ EFFECT = JointTorqueEffect(
     sentence="The {joint} of {target} gives {error:+.3g} of the reported torque in addition.",
     parameters=(EffectParameter("error", "1", "relative error of the torque constant", -0.9, 5.0, 0.1, linear=True),),
     sensors=("joint_states",),
-    look_alikes=("payload_mass", "load_dependent_friction", "torque_saturation"),
+    look_alikes=("payload_mass", "load_dependent_friction", "torque_saturation", "scrub_torque"),
     separating_experiment="add a known mass and repeat; drive on a known slope",
     torque=torque_gain_error,
     motor_side=True,

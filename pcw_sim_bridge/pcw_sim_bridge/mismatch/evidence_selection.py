@@ -45,6 +45,7 @@ LONG_WAY = 20  # rounds in which a problem is made exact, from the description o
 LEAST_STAND_IN = 30.0
 # Waves of a floor are tried anew beside what was found: these lengths [m], and so many directions; the best few are refined.
 WAVELENGTHS, WAVE_DIRECTIONS, WAVE_STARTS = np.geomspace(0.3, 4.0, 10), 12, 3
+HIDDEN_WAVE = -2.0  # nats that a wave of a first look costs at most to be searched from there
 # What is off at all drives and all steerings and gave way to one cause in the chassis has at most these log odds against it.
 REPLACED_ODDS = -1.0
 # So often a chosen set is asked whether something that was dropped should come back.
@@ -117,7 +118,17 @@ class EffectSearch(SetGrowth):
         # Of all numbers this one moves far in healthy robots, and what every torque does hangs on it.
         self.problem = self.problem.with_soft_tyres()
         self.unexplained = self.problem, self._point
-        instances = self.over_complete()
+        regression, instances = self._grown()
+        threshold = self.calibrate(regression, instances)
+        selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
+        selection = self.with_best_waves(self.with_hidden_waves(self.gathered(self.afresh(selection))))
+        selection = self.against_alike(self.against_fewer(selection))
+        selection = self.with_one_look_alike(self.with_one_cause(selection))
+        return self.with_outlines(self.bounded(self.retuned_away(selection)))
+
+    def _grown(self, instances: tuple[Instance, ...] = ()) -> tuple[WhitenedRegression, tuple[Instance, ...]]:
+        """More than there is to be found, from some effects on, and its noise."""
+        instances = self.over_complete(instances)
         regression = self.whiten_beside(instances)
         for _ in range(3):
             before = instances
@@ -126,12 +137,7 @@ class EffectSearch(SetGrowth):
             regression = self.whiten_beside(instances)
             if {(i.term, i.shape) for i in before} == {(i.term, i.shape) for i in instances}:
                 break
-        threshold = self.calibrate(regression, instances)
-        selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
-        selection = self.with_best_waves(self.gathered(self.afresh(selection)))
-        selection = self.against_alike(self.against_fewer(selection))
-        selection = self.with_one_look_alike(self.with_one_cause(selection))
-        return self.with_outlines(self.bounded(self.retuned_away(selection)))
+        return regression, instances
 
     def settle_on(self, selection: Selection, threshold: float) -> Selection:
         """Make the problem exact at what was chosen, add what was dropped too early, and choose again.
@@ -354,7 +360,8 @@ class EffectSearch(SetGrowth):
             others = instances[:index] + instances[index + 1 :]
             here = self.problem, self._point
             starts = [(here, self._alike(selection, others, instance))]
-            if self._is_strained(selection.fit):
+            # A first order may lead nowhere: far out, or from an effect in proportion to its number to one that is not.
+            if self._is_strained(selection.fit) or not self.problem.terms[instance.term].is_curved:
                 starts.append(self._alike_from_description(selection, others, instance))
             own: tuple[float, FloatArray] | None = None
             for start, rivals in starts:
@@ -388,9 +395,9 @@ class EffectSearch(SetGrowth):
         mine, known = terms[own.term], all_effects().get(terms[own.term].effect)
         regression = selection.regression.moved(problem)
         found = []
-        for k, term in enumerate(terms if known is not None and mine.is_curved else ()):
+        for k, term in enumerate(terms if known is not None else ()):
             assert known is not None
-            if term.effect not in known.look_alikes or term.target != mine.target or not term.is_curved:
+            if term.effect not in known.look_alikes or term.target != mine.target or not (term.is_curved or mine.is_curved):
                 continue
             candidates = regression.scan(others, only=[k])[0]
             if candidates and math.isfinite(candidates[0].gain) and not self.repeats(candidates[0].instance, others):
@@ -440,6 +447,40 @@ class EffectSearch(SetGrowth):
                 if regression.within_bounds(fit):
                     found.append((candidate.instance, fit))
         return found
+
+    def with_hidden_waves(self, selection: Selection) -> Selection:
+        """The selection with waves of a floor, where a first look was right but for a little.
+
+        Over a long way waves that differ by a hundredth part, or lie a few degrees otherwise, have little to do with each
+        other: what a grid is next to explains nothing yet, and another wave of it may look better.
+        """
+        terms, instances = self.problem.terms, selection.fit.instances
+        term = next((k for k, own in enumerate(terms) if "wavelength" in own.resolution), None)
+        if term is None or any(instance.term == term for instance in instances):
+            return selection
+        regression, active = selection.regression, terms[term].base_indices()
+        starts = [Instance(term, tuple(sorted(shape.items())), active) for shape in terms[term].shapes]
+        gains = [regression.fit((*instances, start)).log_evidence - selection.fit.log_evidence for start in starts]
+        best = [starts[k] for k in np.argsort(gains)[-WAVE_STARTS:] if gains[k] > HIDDEN_WAVE]
+        rivals = [refined_shape(regression, instances, start) for start in best]
+        fits = [regression.fit((*instances, rival)) for rival in rivals]
+        fits = [fit for fit in fits if regression.within_bounds(fit)]
+        if not fits:
+            return selection
+        found = max(fits, key=lambda fit: fit.log_evidence)
+        gain = found.log_evidence - selection.fit.log_evidence - math.log(max(terms[term].grid_size, 1))
+        if gain < max(selection.threshold, STEADY_EVIDENCE):
+            return selection
+        self.progress(f"+ {self.label(found.instances[-1])}, which was next to what a first look saw: {gain:.1f} nats")
+        # What was named while it hid may stand for a part of it: all is asked again beside the waves.
+        here = self.problem, self._point
+        self.problem, self._point = self.unexplained
+        regression, chosen = self._grown(self.made_exact(found.instances[-1:]))
+        instead = self.settle_on(self.prune(regression, chosen, selection.threshold), selection.threshold)
+        if any(instance.term == term for instance in instead.fit.instances):
+            return instead
+        self.problem, self._point = here
+        return selection
 
     def with_best_waves(self, selection: Selection) -> Selection:
         """The selection with the waves of a floor that fit best beside the rest of it.

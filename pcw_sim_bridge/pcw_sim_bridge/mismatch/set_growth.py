@@ -48,12 +48,14 @@ class SetGrowth(ExactProblem):
         self.progress = progress
         self.ladder: list[LadderStep] = []
 
-    def over_complete(self) -> tuple[Instance, ...]:
+    def over_complete(self, instances: tuple[Instance, ...] = ()) -> tuple[Instance, ...]:
         """A set that explains more than there is, by plain least squares: what it leaves is the first idea of the noise.
 
         Every residual that still holds a large effect looks like strong slow noise, under which nothing could be found.
+
+        Args:
+            instances: to begin with.
         """
-        instances: tuple[Instance, ...] = ()
         regression = self.whiten_at(self.problem.residual, white=True, by_channel=True)
         settled = False
         while len(instances) < self.settings.largest_set:
