@@ -37,7 +37,7 @@ from pcw_sim_bridge.mismatch.challenge.outside_effects import OUTSIDE_EFFECTS
 from pcw_sim_bridge.mismatch.explanation import Estimate, NamedTerm
 from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
 from pcw_sim_bridge.mismatch.law_search import _Screened
-from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier, plain_expression
+from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier, plain_expression, plain_forms
 from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Sites, Term
 from pcw_sim_bridge.mismatch.report import write_report
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -367,6 +367,7 @@ FILES = [
     law_of(SITE, Factor("value", SPEED), "drive_angle/front_left", fourier(Basis("periodic", ((-np.pi, np.pi),)))),
     law_of("steer_torque/front_left", Factor(), "steer_angle/front_left", Basis("map", KNOTS)),
     law_of(SITE, Factor("value", SITE), SPEED, Basis("speed", KNOTS, 0.05)),
+    *plain_forms(law_of(SITE, Factor(), SITE, Basis("map", KNOTS))),
 ]
 
 
@@ -387,6 +388,7 @@ def test_a_file_says_what_the_law_says(law, tmp_path):
     made = generate(law, weights, ["a_bag"])
     effect = loaded(made, tmp_path / "effects")
     assert isinstance(effect, JointTorqueEffect) and effect.axis == axis
+    assert ("Beyond the range" in made.source) == getattr(law.basis, "clipped", True)
     np.testing.assert_allclose(effect.contribution(q, v, tau, load, made.parameters), factor * size, rtol=1e-4, atol=1e-4)
     step = 1e-5
     numbers = effect.values(made.parameters)

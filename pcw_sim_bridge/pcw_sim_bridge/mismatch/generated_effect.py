@@ -208,13 +208,14 @@ class _Body:
 
     Attributes:
         helper: lines before the kernel; lines: of the kernel, which set `size`; slope: those that set `slope`.
-        formula: in short.
+        formula: in short; clipped: whether it stays what it is at the ends of what was seen.
     """
 
     helper: tuple[str, ...]
     lines: tuple[str, ...]
     slope: tuple[str, ...]
     formula: str
+    clipped: bool = True
 
 
 def parameters_of(basis: Basis, weights: FloatArray) -> dict[str, float]:
@@ -294,7 +295,7 @@ def _closed(basis: ClosedForm, argument: str) -> _Body:
         name + ("" if atom.shape is ONE else f" {atom.written('z')}") for name, atom in zip(names, basis.atoms, strict=True)
     )
     slope = f"slope = ({' + '.join(slopes) or '0.0'}){inside}"
-    return _Body((), tuple(lines), (slope,), formula)
+    return _Body((), tuple(lines), (slope,), formula, basis.clipped)
 
 
 def _times(atom: Atom) -> str:
@@ -351,11 +352,11 @@ class _Parts:
         text = "\n".join([*body.helper, *kernel])
         functions = sorted(name for name in ("cos", "exp", "sin", "sqrt", "tanh") if f"{name}(" in text.replace(".tanh(", ""))
         origin = [f"    {name}" for name in recordings]
+        ends = ["", "Beyond the range that these cover it is continued by its value at the end."] if body.clipped else []
         lines = [
             f'"""{self.what[0].upper() + self.what[1:]}, as the mismatch analyser found it.', "",
             "It is no known physics: a closed form or a curve fitted to what named effects leave in the recordings", "",
-            *origin, "",
-            "Beyond the range that these cover it is continued by its value at the end.", '"""', "",
+            *origin, *ends, '"""', "",
         ]  # fmt: skip
         if functions:
             lines += [f"from math import {', '.join(functions)}", ""]
