@@ -38,8 +38,8 @@ _Base = tuple[str, Factor]
 LAW_MARGIN = 15.0
 # Logarithm of their number: what the best of them gains for having been chosen.
 HYPOTHESES_COST = 8.0
-# The same of plain functions in place of a name: there are few, of as many numbers as the name. In place of names that are
-# right none came nearer than 12 nats less.
+# Nats by which plain functions in place of a name must do better, and the logarithm of how many there are: few, and of as many
+# numbers as the name. In place of names that were right none came nearer than 10 nats less.
 PLAIN_MARGIN, PLAIN_COST = 5.0, 2.0
 # Samples of a channel count as so many fewer in the screening, where the colour of the noise is not looked at.
 SCREENING_CORRELATION = 5.0
