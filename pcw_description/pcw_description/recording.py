@@ -31,6 +31,7 @@ Codes of the warnings:
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -158,6 +159,13 @@ class Recording:
         recording = cls(Path(name), robot, {}, messages)
         _ = recording.joint_states
         return recording
+
+    def decoded(self) -> Recording:
+        """Return a copy with all series, and without most of what they came from; `columns` reads the files again."""
+        _ = self.warnings, self.sha256
+        light = copy.copy(self)
+        light._raw = {}
+        return light
 
     # --- What is there ----------------------------------------------------------------------------------
 

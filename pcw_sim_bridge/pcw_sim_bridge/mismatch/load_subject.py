@@ -6,20 +6,22 @@ from pathlib import Path
 
 from pcw_description.axis_recording import FORMAT as AXIS_FORMAT
 from pcw_description.description_fields import load_yaml_mapping
+from pcw_description.recording import Recording
 from pcw_description.robot_description import FORMAT as ROBOT_FORMAT
 from pcw_description.robot_file import robot_path, shipped_robots
 
 from .axis_subject import AxisSubject
 from .errors import MismatchError
-from .robot_subject import RobotSubject
+from .robot_subject import Reader, RobotSubject
 from .subject import Subject
 
 
-def load_subject(description: str) -> Subject:
+def load_subject(description: str, read: Reader = Recording.open) -> Subject:
     """Load a description of either kind.
 
     Args:
         description: path of a `pcw_robot/1` or `pcw_axis/1` file, or the name of a shipped robot.
+        read: opens recordings of a robot.
 
     Raises:
         PcwError: no such file, or it is not valid.
@@ -31,5 +33,5 @@ def load_subject(description: str) -> Subject:
     if found == AXIS_FORMAT:
         return AxisSubject.load(path)
     if found == ROBOT_FORMAT:
-        return RobotSubject.load(path)
+        return RobotSubject.load(path, read)
     raise MismatchError(f"{path}: format is {found!r}; allowed: {ROBOT_FORMAT} or {AXIS_FORMAT}")

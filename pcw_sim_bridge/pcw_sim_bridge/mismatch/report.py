@@ -13,7 +13,7 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,8 @@ from pcw_description.effects.registry import PATH_VARIABLE
 
 from .errors import MismatchError
 from .findings import VERDICTS, ChannelProof, Findings, ParameterFinding, RetunedFinding, RolloutProof
-from .report_drawing import SUPERSCRIPTS, Drawing, pretty_unit
-from .report_figures import TraceFigures, draw_traces, time_origin
+from .report_drawing import SUPERSCRIPTS, Drawing, Task, done, pretty_unit
+from .report_figures import TraceFigures, time_origin, trace_drawings
 from .report_maps import draw_maps
 
 HTML, JSON, PATCHED, FIGURES, EFFECTS = "report.html", "report.json", "robot_patched.yaml", "figures", "effects"
@@ -157,6 +157,7 @@ def write_report(
     out: Path,
     force: bool = False,
     with_laws: Mapping[str, Any] | None = None,
+    do: Callable[[Sequence[Task]], list[Any]] = done,
 ) -> Path:
     """Write report.html, report.json, robot_patched.yaml, figures/ and effects/ to a folder, all of them or nothing.
 
@@ -166,6 +167,7 @@ def write_report(
         out: the folder; made, with its parents, if need be.
         force: replace an earlier report there.
         with_laws: the description with the effects that were generated, too; None leaves the file out.
+        do: returns what all tasks make.
 
     Returns:
         The path of report.html.
@@ -187,8 +189,10 @@ def write_report(
                     _write(folder / EFFECTS / f"{leftover.effect.name}.py", leftover.effect.source)
             if with_laws is not None:
                 _write(folder / EFFECTS / WITH_LAWS, f"# Where {PATH_VARIABLE} names this folder.\n{_yaml(with_laws)}")
-            figures = draw_traces(findings)
-            maps = None if findings.residual_map is None else draw_maps(findings.residual_map)
+            # First that which takes longest.
+            on_maps = [] if findings.residual_map is None else [(draw_maps, (findings.residual_map,))]
+            drawn = do([*on_maps, *trace_drawings(findings)])
+            maps, figures = (drawn[0], drawn[1:]) if on_maps else (None, drawn)
             (folder / FIGURES).mkdir()
             for drawing in (maps, *(d for t in figures for d in (t.over_time, t.window, t.against_variable))):
                 if drawing is not None:

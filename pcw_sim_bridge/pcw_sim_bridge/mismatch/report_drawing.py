@@ -9,6 +9,7 @@ import dataclasses
 import io
 import re
 import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,9 @@ RESOLUTION = 130  # dots per inch
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+Task = tuple[Callable[..., Any], tuple[Any, ...]]  # a function and its arguments
+
+
 @dataclasses.dataclass(frozen=True)
 class Drawing:
     """One figure: the name of its file without suffix, its content, its size on paper [CSS pixels], what it shows."""
@@ -29,6 +33,11 @@ class Drawing:
     width: int
     height: int
     description: str
+
+
+def done(tasks: Sequence[Task]) -> list[Any]:
+    """Return what tasks make, one after the other."""
+    return [function(*arguments) for function, arguments in tasks]
 
 
 def pretty_unit(unit: str) -> str:

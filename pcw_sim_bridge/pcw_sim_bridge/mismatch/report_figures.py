@@ -22,6 +22,7 @@ from .report_drawing import (
     MEASURED,
     SHADE,
     Drawing,
+    Task,
     dress,
     finish,
     legend,
@@ -82,14 +83,15 @@ def time_origin(findings: Findings) -> float:
     return earliest if abs(earliest) > EPOCH else 0.0
 
 
-def draw_traces(findings: Findings) -> list[TraceFigures]:
-    """Draw the traces of the channels in which nominal and patched model differ most."""
+def trace_drawings(findings: Findings) -> list[Task]:
+    """Return what draws the traces of the channels in which nominal and patched model differ most, a task for each."""
     origin = time_origin(findings)
-    drawn = []
+    tasks: list[Task] = []
     for number, trace in enumerate(telling(findings.traces), start=1):
         places = [p for p in findings.locations if trace.channel in p.channels] if trace.role == "fit" else []
-        drawn.append(draw_trace(trace, f"{number:02d}_{file_stem(trace.channel)}_{file_stem(trace.role)}", origin, places))
-    return drawn
+        stem = f"{number:02d}_{file_stem(trace.channel)}_{file_stem(trace.role)}"
+        tasks.append((draw_trace, (trace, stem, origin, places)))
+    return tasks
 
 
 def telling(traces: Sequence[Trace]) -> list[Trace]:

@@ -256,8 +256,9 @@ def rollout_floor(
         noisy, path = _with_noise(part, rng), part.path + rng.standard_normal(part.path.shape) * part.noise[2]
         seen = _signals(part, part.motion.position, part.motion.velocity, part.path)[ends]
         seen_again = _signals(part, noisy.position, noisy.velocity, path)[ends]
-        moved = _simulated(robot, dataclasses.replace(part, motion=noisy, path=path), undescribed)
-        found.append(_squares(moved - _simulated(robot, part, undescribed) - (seen_again - seen)))
+        shifted = dataclasses.replace(part, motion=noisy, path=path)
+        moved, plain = on_all_cores(lambda one: _simulated(robot, one, undescribed), (shifted, part))
+        found.append(_squares(moved - plain - (seen_again - seen)))
     return np.concatenate(found) if found else np.zeros((0, len(HORIZONS), len(SIGNALS)))
 
 

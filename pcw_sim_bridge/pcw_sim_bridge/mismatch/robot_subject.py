@@ -58,13 +58,14 @@ OFF_GROUND = "joint_states: the wheels turn and the robot stands: they are off t
 UNBALANCED = 0.15  # of the force that torques make, which a steering that is turned far leaves at least
 LEAST_PART = 0.1  # of a number that cannot vanish, however far a fit runs off
 WEIGHED = 0.3  # of the mean square that a ripple makes, which may be left beside it
+Reader = Callable[[Path, RobotDescription, Mapping[str, str]], Recording]
 
 
 class RobotSubject:
     """A robot; see `Subject`."""
 
-    def __init__(self, robot: RobotDescription) -> None:
-        self.robot = robot
+    def __init__(self, robot: RobotDescription, read: Reader = Recording.open) -> None:
+        self.robot, self._read = robot, read
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
         self._choosing = threading.Lock()
@@ -74,18 +75,18 @@ class RobotSubject:
         self._lifted: tuple[Path, bool] | None = None
 
     @classmethod
-    def load(cls, path: Path) -> RobotSubject:
-        """Load a `pcw_robot/1` file."""
-        return cls(load_robot(path))
+    def load(cls, path: Path, read: Reader = Recording.open) -> RobotSubject:
+        """Load a `pcw_robot/1` file; `read` opens its recordings."""
+        return cls(load_robot(path), read)
 
     def open(self, path: Path, role: str, topics: Mapping[str, str]) -> Opened:
         """Read one rosbag2 folder or file."""
-        recording = Recording.open(path, self.robot, topics)
+        recording = self._read(path, self.robot, topics)
         found = recording.warnings
         missing = _missing_casters(self.robot, recording)
         self._check_casters(path, missing)
         if missing:
-            recording = Recording.open(path, self._seen_robot(), topics)
+            recording = self._read(path, self._seen_robot(), topics)
             # The force of one caster unknown, that of all together is.
             joints = recording.joint_states
             recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))

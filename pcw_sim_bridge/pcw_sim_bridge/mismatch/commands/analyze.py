@@ -6,11 +6,14 @@ import argparse
 import gc
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import MismatchError
+
+if TYPE_CHECKING:
+    from ..helper_processes import HelperProcesses
 
 
 def add_parser(commands: Any) -> None:
@@ -55,6 +58,20 @@ def remapped_topics(remaps: Sequence[str]) -> dict[str, str]:
 def run(options: argparse.Namespace) -> int:
     """Analyse, write the report, print its path and five lines."""
     from pcw_description.one_heap import one_heap
+
+    from ..helper_processes import HelperProcesses
+
+    one_heap()
+    topics = remapped_topics(options.topic)
+    for path in (*options.recordings, *options.holdout):
+        if not path.exists():
+            raise MismatchError(f"{path}: no such recording")
+    with HelperProcesses() as helpers:
+        helpers.begin((*options.recordings, *options.holdout), options.robot, topics)
+        return _analysed(options, topics, helpers)
+
+
+def _analysed(options: argparse.Namespace, topics: Mapping[str, str], helpers: HelperProcesses) -> int:
     from pcw_description.one_thread import one_thread
 
     from ..analysis import analyse
@@ -62,12 +79,7 @@ def run(options: argparse.Namespace) -> int:
     from ..report import check_output, write_report
 
     one_thread()  # the analysis has its own, see `all_cores`: those of linear algebra would take turns with them, and spin
-    one_heap()
     gc.freeze()  # what has been imported stays; to look through all of it for garbage at the end takes half a second
-    topics = remapped_topics(options.topic)
-    for path in (*options.recordings, *options.holdout):
-        if not path.exists():
-            raise MismatchError(f"{path}: no such recording")
     check_output(options.out, options.force)
     begun = time.monotonic()
 
@@ -75,11 +87,11 @@ def run(options: argparse.Namespace) -> int:
         if not options.quiet:
             print(f"[{time.monotonic() - begun:6.1f} s] {message}", file=sys.stderr, flush=True)
 
-    subject = load_subject(options.robot)
+    subject = load_subject(options.robot, helpers.open)
     analysis = analyse(subject, options.recordings, options.holdout, topics, options.seed, progress)
     progress("writing the report")
     report = write_report(
-        analysis.findings, analysis.patched.mapping(), options.out, options.force, analysis.with_laws
+        analysis.findings, analysis.patched.mapping(), options.out, options.force, analysis.with_laws, helpers.do
     )
     print(report)
     for line in analysis.findings.summary():
