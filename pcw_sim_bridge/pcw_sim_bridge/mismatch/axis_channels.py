@@ -31,9 +31,10 @@ from .regression_problem import (
     RegressionProblem,
     Shape,
     Sites,
+    SizedTerm,
     Term,
 )
-from .signal_filter import SignalFilter, derivative, refined, uniform_segments, white_noise_level
+from .signal_filter import SignalFilter, derivative, reading_noise_level, refined, uniform_segments
 from .unknown_law import TRAVEL
 
 LARGEST_CUTOFF = (
@@ -82,7 +83,7 @@ def choose_cutoff(axis: AxisDescription, recordings: Sequence[AxisRecording]) ->
     for recording in recordings:
         rate = 1.0 / float(np.median(np.diff(recording.time)))
         limit = min(LARGEST_CUTOFF, rate / SAMPLES_PER_CUTOFF)
-        noise = white_noise_level(recording.position) if recording.velocity is None else 0.0
+        noise = reading_noise_level(recording.position) if recording.velocity is None else 0.0
         allowed = ALLOWED_DERIVATIVE_NOISE * max(float(np.std(recording.force)), 1e-300) / axis.inertia
         if noise > 0.0:
             limit = min(limit, (allowed**2 * 5.0 * rate / (2.0 * noise**2 * (2.0 * np.pi) ** 4)) ** 0.2)
@@ -102,7 +103,7 @@ def axis_motion(
     signals = np.stack([recording.position, velocity, recording.force + recording.external_force], axis=1)
     rate, pieces = uniform_segments(recording.time, signals, largest_gap=0.02)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
-    noise = white_noise_level(recording.position)
+    noise = reading_noise_level(recording.position)
     # Deviation of the velocity of a noisy position after the wide filter.
     creep = noise * np.sqrt(2.0 / rate * (2.0 * np.pi) ** 2 * min(wide.cutoff, 0.5 * rate) ** 3 / 3.0)
     factor = max(1, math.ceil(FINE_SAMPLES_PER_CUTOFF * cutoff / rate))
@@ -178,7 +179,8 @@ class AxisProblemBuilder:
         self._acceleration = self._variables["acceleration"]
         self._valid = self._filtered([m.still for m in self.motions]) < 0.1
         self._scans: dict[str, FloatArray] = {}
-        self._smooth_forces = self._plain_forces = self._explained_force(())
+        self._plain_forces = self._explained_force((), in_channel=True)
+        self._smooth_forces = self._explained_force(())
         periodic = self._leading_periodic()
         self._smooth_forces = self._explained_force(periodic)
         self._smooth_forces = self._explained_force(periodic, with_load=True)
@@ -191,7 +193,7 @@ class AxisProblemBuilder:
         )
 
     def _explained_force(
-        self, periodic: Sequence[tuple[JointTorqueEffect, Shape]], with_load: bool = False
+        self, periodic: Sequence[tuple[JointTorqueEffect, Shape]], with_load: bool = False, in_channel: bool = False
     ) -> list[FloatArray]:
         """The force as the simplest models of a drive would have it, at full rate.
 
@@ -199,6 +201,9 @@ class AxisProblemBuilder:
             periodic: effects periodic in position that take part, with their shapes.
             with_load: include a friction that follows the load as it is explained so far, which only effects non-linear in
                 the force need.
+            in_channel: fit it in the band of the channel, where it is in proportion to the force that acts. In the wider band
+                the noise of an acceleration may be as large as itself, and what is fitted there is smoother than the force:
+                so it has to be where its magnitude is taken.
 
         Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
         and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
@@ -220,8 +225,10 @@ class AxisProblemBuilder:
 
         loads = self._smooth_forces if with_load else [None] * len(self.motions)
         parts = [basis(m, load) for m, load in zip(self.motions, loads, strict=True)]
-        stacked = np.concatenate(parts)
-        force = np.concatenate([m.force for m in self.motions])
+        if in_channel and self._valid.any():
+            stacked, force = self._filtered(parts)[self._valid], self._force[self._valid]
+        else:
+            stacked, force = np.concatenate(parts), np.concatenate([m.force for m in self.motions])
         size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
         solution, *_ = np.linalg.lstsq(stacked / size, force, rcond=1e-8)
         scaled = solution / size
@@ -377,7 +384,19 @@ class AxisProblemBuilder:
             terms=tuple(terms),
             variables=variables,
             sites=self._sites(start, smoothing),
+            exact=functools.partial(self._residual_of_clocks, predicted),
         )
+
+    def _residual_of_clocks(
+        self, predicted: FloatArray, changes: Mapping[str, float], sizes: Sequence[SizedTerm]
+    ) -> tuple[FloatArray, Sequence[str]]:
+        """Residual (T, 1) with the force put back to when it acted, and that this is what it holds of the changes.
+
+        All else is linear; a clock or a motor that is late by more than a sample is not, where frictions change their sign.
+        """
+        late = changes["clock_offset"]
+        acted = [np.interp(m.time + late, m.time, m.force) for m in self.motions]
+        return (self._filtered(acted) - predicted)[:, None], ["clock_offset"]
 
     @functools.cached_property
     def _travels(self) -> list[FloatArray]:
@@ -425,11 +444,13 @@ class AxisProblemBuilder:
         fixed |= {SMOOTHING: smoothing} if SMOOTHING in fixed else {}
         shapes: list[dict[str, float]] = [dict(fixed)]
         resolution: dict[str, tuple[str, float]] = {}
-        periodic = None
+        periodic, most = None, {}
         for parameter in effect.nonlinear_parameters:
             if parameter.name in fixed:
                 continue
             grid, kind, step = self._shape_grid(parameter)
+            if parameter.unit == "rad/s":
+                most[parameter.name] = float(np.max(np.abs(self._variables["velocity"])))
             resolution[parameter.name] = (kind, step)
             shapes = [{**shape, parameter.name: float(value)} for shape in shapes for value in grid]
             if kind == "linear":
@@ -456,6 +477,7 @@ class AxisProblemBuilder:
             repeatable=periodic is not None,
             resolution=resolution,
             least={periodic: self._least_order(shapes[0][periodic])} if periodic is not None else {},
+            most=most,
             whole=(periodic,) if periodic is not None and self.axis.kind == "rotary" else (),
             scan=(lambda: self._periodic_scan(effect, shapes, periodic)) if periodic is not None else None,
         )

@@ -15,7 +15,7 @@ from pcw_description.effects.registry import get
 from .axis_channels import PREFILTER_RATIO, AxisMotion, axis_motion
 from .regression_problem import FloatArray, IntArray
 from .rollout import Windows, rows_of, window_rows
-from .signal_filter import SignalFilter, derivative, white_noise_level
+from .signal_filter import SignalFilter, derivative, reading_noise_level, white_noise_level
 
 SIGNALS = ("position", "velocity")
 
@@ -110,7 +110,7 @@ def _noise(recording: AxisRecording) -> tuple[float, float, float]:
     """Deviations of the white noise of position, speed (0 where it is differentiated) and force."""
     velocity = recording.velocity
     return (
-        white_noise_level(recording.position),
+        reading_noise_level(recording.position),
         0.0 if velocity is None else white_noise_level(velocity),
         white_noise_level(recording.force),
     )

@@ -196,17 +196,23 @@ def explain(
     remarks: tuple[str, ...] = ()
     # A refined law of the library comes before any law outside it: what a friction that differs between directions explains
     # is no unknown function of the speed.
-    refined = _refined(search, selection, result)
-    if refined is not None:
-        finished = OpenSetTest(search, refined.instances).run(selection.threshold)
-        arguments = problem.terms[refined.instances[refined.position].term].arguments
-        better = search.conclude(refined.instances, selection.threshold)
+    refined = None
+    for attempt in (_refined, _refined_from_the_start):
+        tried = attempt(search, selection, result)
+        if tried is None:
+            continue
+        finished = OpenSetTest(search, tried.instances).run(selection.threshold)
+        arguments = problem.terms[tried.instances[tried.position].term].arguments
+        better = search.conclude(tried.instances, selection.threshold)
         if not finished.vetoed and not {left.variable for left in finished.leftovers} & set(arguments):
-            progress(f"refined: {search.label(refined.instances[refined.position])}, {refined.gain:.1f} nats")
-            remarks = _remarks(search, selection, refined)
-            selection, result, doubts = better, finished, refined.doubts(problem)
-        else:
-            suspect = Refinement(named_terms(search, better), refined.put_out(search), refined.gain, refined.share)
+            progress(f"refined: {search.label(tried.instances[tried.position])}, {tried.gain:.1f} nats")
+            remarks = _remarks(search, selection, tried)
+            selection, result, doubts = better, finished, tried.doubts(problem)
+            refined, suspect = tried, None
+            break
+        if refined is None:
+            refined = tried
+            suspect = Refinement(named_terms(search, better), tried.put_out(search), tried.gain, tried.share)
             progress(f"not adopted: {suspect.describe()}")
     judgement = judge(search, selection, result)
     search, result = judgement.search, judgement.result
@@ -488,6 +494,46 @@ def _refined(search: EffectSearch, selection: Selection, result: OpenSetResult) 
     if best is None:
         return _instead_of_another(search, selection)
     return _searched_again(search, best, threshold)
+
+
+def _refined_from_the_start(search: EffectSearch, selection: Selection, result: OpenSetResult) -> _Refined | None:
+    """The set of a search in which refinements are parameters like all others, each kept where the recording needs it.
+
+    What a refinement and a further effect, or two refinements, explain together looks like slow noise as long as any of it is
+    missing: step by step neither is found. Where no effect is named there is none to refine.
+    """
+    problem, threshold, plain = search.problem, selection.threshold, selection.fit.instances
+    whole = tuple(
+        dataclasses.replace(term, parameters=tuple(dataclasses.replace(p, refinement=False) for p in term.parameters))
+        for term in problem.terms
+    )
+    if not plain or not result.leftovers or whole == problem.terms:
+        return None
+    instances = EffectSearch(dataclasses.replace(problem, terms=whole), search.rng, search.settings).run().fit.instances
+    regression = search.whiten_beside(instances)
+    while True:
+        own = regression.fit(instances).log_evidence
+        losses = {}
+        for position, instance in enumerate(instances):
+            needed = [k for k in instance.active if not problem.terms[instance.term].parameters[k].refinement]
+            if needed and len(needed) < len(instance.active):
+                simpler = dataclasses.replace(instance, active=tuple(needed))
+                fewer = (*instances[:position], simpler, *instances[position + 1 :])
+                losses[position] = own - regression.fit(fewer).log_evidence, fewer
+        if not losses:
+            return None
+        loss, fewer = min(losses.values(), key=lambda one: one[0])
+        if loss > threshold - REFINEMENT_LOG_PRIOR:
+            break
+        instances = fewer
+    fit, before = regression.fit(instances), regression.fit(plain)
+    gain = fit.log_evidence - before.log_evidence + len(losses) * REFINEMENT_LOG_PRIOR
+    held_out = float(np.sum(regression.block_scores(plain) - regression.block_scores(instances)))
+    if gain < threshold or held_out <= 0.0 or not regression.within_bounds(fit):
+        return None
+    left = [float(np.sum(search.residual_of(chosen)[problem.valid] ** 2)) for chosen in (plain, instances)]
+    position = max(losses, key=lambda one: losses[one][0])
+    return _Refined(plain, instances, position, {}, gain, 1.0 - left[1] / max(left[0], 1e-300))
 
 
 def _instead_of_another(search: EffectSearch, selection: Selection) -> _Refined | None:

@@ -169,6 +169,16 @@ def white_noise_level(values: FloatArray) -> float:
     return max(robust, ordinary) / np.sqrt(70.0) if robust == 0.0 else robust / np.sqrt(70.0)
 
 
+def reading_noise_level(values: FloatArray) -> float:
+    """Standard deviation of the white part of what is read in steps, where it moves: standing still it has none."""
+    changed = np.diff(values) != 0.0
+    moves = np.flatnonzero(np.convolve(changed, np.ones(4)) > 0.0)
+    moves = moves[(moves >= 3) & (moves < len(changed))] - 3
+    if len(moves) < 16:
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(np.diff(values, 4)[moves]))) / np.sqrt(70.0)
+
+
 def uniform_segments(
     time: FloatArray, signals: FloatArray, largest_gap: float
 ) -> tuple[float, list[tuple[FloatArray, FloatArray]]]:

@@ -1,0 +1,125 @@
+"""Servos as people have them: read in coarse steps, without a speed, commanded late; simulated by laws written out here."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pcw_description.axis_recording import AxisRecording, parse_axis_description
+from pcw_description.compiled import compiled
+from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
+from pcw_sim_bridge.mismatch.explanation import Explanation, explain
+from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
+
+VISCOUS, COULOMB, GEAR = "drive_viscous_friction", "drive_coulomb_friction", "load_dependent_friction"
+INERTIA, MOMENT, RATE, SUBSTEPS = 0.02, 0.6, 200.0, 50
+READ = 2.0 * np.pi / 4096.0
+
+
+@compiled
+def servo(goal, speed, arm, coulomb, forwards, backwards, gear, gain, lag):  # type: ignore[no-untyped-def]
+    """Angle and commanded torque at every sample of a servo that follows a goal."""
+    step = 1.0 / RATE / SUBSTEPS
+    angles, torques = np.empty(len(goal)), np.empty(len(goal))
+    angle, rate, given = goal[0], 0.0, 0.0
+    for k in range(len(goal)):
+        torque = 12.0 * (goal[k] - angle) + 0.6 * (speed[k] - rate)
+        angles[k], torques[k] = angle, torque
+        for _ in range(SUBSTEPS):
+            given = torque if lag == 0.0 else given + (torque - given) * step / lag
+            weight = arm * math.sin(angle)
+            level = coulomb + gear * 0.5 * (abs(gain * given) + abs(weight))
+            friction = level * math.tanh(rate / 1e-3) + (forwards if rate > 0.0 else backwards) * rate
+            rate += step * (gain * given - weight - friction) / INERTIA
+            angle += step * rate
+    return angles, torques
+
+
+def goal(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Angle over a minute: moves with pauses, sines, or turning at changing speeds."""
+    time = np.arange(round(60.0 * RATE)) / RATE
+    if kind == "moves":
+        places = rng.uniform(-1.6, 1.6, 52)
+        number, within = np.divmod(time, 1.2)
+        part = np.clip(within / 0.9, 0.0, 1.0)
+        smooth = 10.0 * part**3 - 15.0 * part**4 + 6.0 * part**5
+        at = number.astype(int)
+        return np.asarray(places[at] + (places[at + 1] - places[at]) * smooth - places[0])
+    if kind == "turning":
+        return np.asarray(np.cumsum(np.interp(time, np.linspace(0.0, 60.0, 30), rng.uniform(-8.0, 8.0, 30))) / RATE)
+    waves = zip((0.9, 0.5, 0.25, 0.1), (0.13, 0.31, 0.77, 1.9), rng.uniform(0.0, 6.28, 4), strict=True)
+    return np.asarray(sum(size * (np.sin(2.0 * np.pi * f * time + phase) - np.sin(phase)) for size, f, phase in waves))
+
+
+def explained(
+    kind: str, coulomb: float = 0.0, forwards: float = 0.0, backwards: float | None = None, gear: float = 0.0,
+    gain: float = 1.0, lag: float = 0.0,
+) -> tuple[dict[str, dict[str, float]], Explanation]:  # fmt: skip
+    """Names with their numbers, and all that was found; there is an arm unless it turns."""
+    rng = np.random.default_rng(5)
+    wanted, arm = goal(kind, rng), 0.0 if kind == "turning" else MOMENT
+    given = (arm, coulomb, forwards, forwards if backwards is None else backwards, gear, gain, lag)
+    angle, torque = servo(wanted, np.gradient(wanted, 1.0 / RATE), *given)
+    recording = AxisRecording(
+        path=Path("servo"), time=np.arange(len(angle)) / RATE, position=np.round(angle / READ) * READ, velocity=None,
+        force=np.round((torque + 0.002 * rng.standard_normal(len(torque))) / 0.002) * 0.002,
+        external_force=np.zeros(len(angle)), warnings=(),
+    )  # fmt: skip
+    description = {
+        "format": "pcw_axis/1", "name": "servo", "kind": "rotary", "provenance": {"all": "made up"},
+        "columns": {"time": "t", "position": "q", "force": "tau"}, "inertia": 0.98 * INERTIA, "tolerances": {"inertia": "5 %"},
+    }  # fmt: skip
+    if arm:
+        description["gravity_arm"] = {"moment": 1.015 * MOMENT, "hanging_position": 0.0}
+    builder = AxisProblemBuilder(parse_axis_description(description), [recording])
+    found = explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
+    return {n.term.effect: {k: e.value for k, e in n.estimates.items()} for n in found.named}, found
+
+
+@pytest.mark.parametrize("kind", ["moves", "sines", "turning"])
+def test_a_healthy_servo_has_nothing_more(kind: str) -> None:
+    names, found = explained(kind)
+    assert names == {} and found.leftovers == ()
+
+
+def test_what_is_read_in_steps_is_as_noisy_as_it_is_where_it_moves() -> None:
+    """Standing still it reads the same all the time, which is no precision."""
+    read = np.round(goal("moves", np.random.default_rng(0)) / READ) * READ
+    assert np.mean(np.diff(read) == 0.0) > 0.3
+    assert reading_noise_level(read) == pytest.approx(READ / math.sqrt(12.0), rel=0.25)
+    assert reading_noise_level(np.zeros(1000)) == 0.0
+
+
+def test_frictions_of_a_servo_that_pauses() -> None:
+    """With the noise of its pauses the speed would be taken for far more precise than it is, and friction for hysteresis."""
+    names, found = explained("moves", coulomb=0.04, forwards=0.02, gear=0.15)
+    assert set(names) == {VISCOUS, COULOMB, GEAR} and found.leftovers == ()
+    # The gear here rubs by the mean of what both its sides bear, that of the library by what the motor gives.
+    assert names[GEAR]["fraction"] == pytest.approx(0.15, rel=0.15)
+    assert names[COULOMB]["coulomb"] == pytest.approx(0.04, rel=0.3)
+    assert names[VISCOUS]["viscous"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_frictions_that_are_found_only_together() -> None:
+    """Beside one of them alone the other, and what differs by direction, look like slow noise."""
+    names, found = explained("turning", coulomb=0.03, forwards=0.02, backwards=0.035)
+    assert set(names) == {VISCOUS, COULOMB} and found.leftovers == ()
+    assert names[VISCOUS]["viscous"] == pytest.approx(0.0275, rel=0.05)
+    assert names[VISCOUS]["asymmetry"] == pytest.approx(-0.0075, rel=0.1)
+    assert names[COULOMB]["coulomb"] == pytest.approx(0.03, rel=0.05)
+
+
+def test_a_motor_that_is_late_by_samples() -> None:
+    """Where friction changes its sign a delay is nothing that a slope tells of."""
+    names, found = explained("sines", coulomb=0.04, lag=0.02)
+    assert set(names) == {COULOMB} and names[COULOMB]["coulomb"] == pytest.approx(0.04, rel=0.1)
+    offset = [n.name for n in found.search.problem.nuisances].index("clock_offset")
+    assert found.fit.mean[offset] == pytest.approx(-0.0225, abs=0.003)  # a command is held for half a sample, besides
+
+
+def test_a_motor_that_gives_less_than_it_is_told() -> None:
+    """The acceleration is mostly noise in the wide band; how much torque it takes is fitted in the channel's."""
+    names, _ = explained("sines", gain=0.7)
+    assert names["torque_constant_error"]["error"] == pytest.approx(-0.3, abs=0.04)
+    assert set(names) <= {"torque_constant_error", VISCOUS} and names.get(VISCOUS, {"viscous": 0.0})["viscous"] < 0.002
