@@ -9,6 +9,7 @@ import pytest
 from pcw_description.axis_recording import AxisRecording, parse_axis_description
 from pcw_description.compiled import compiled
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
+from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.explanation import Explanation, explain
 from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
 
@@ -18,7 +19,7 @@ READ = 2.0 * np.pi / 4096.0
 
 
 @compiled
-def servo(goal, speed, arm, coulomb, forwards, backwards, gear, gain, lag):  # type: ignore[no-untyped-def]
+def servo(goal, speed, arm, coulomb, forwards, backwards, gear, gain, lag, stop):  # type: ignore[no-untyped-def]
     """Angle and commanded torque at every sample of a servo that follows a goal."""
     step = 1.0 / RATE / SUBSTEPS
     angles, torques = np.empty(len(goal)), np.empty(len(goal))
@@ -31,6 +32,7 @@ def servo(goal, speed, arm, coulomb, forwards, backwards, gear, gain, lag):  # t
             weight = arm * math.sin(angle)
             level = coulomb + gear * 0.5 * (abs(gain * given) + abs(weight))
             friction = level * math.tanh(rate / 1e-3) + (forwards if rate > 0.0 else backwards) * rate
+            friction += stop * max(0.0, angle - 0.5)
             rate += step * (gain * given - weight - friction) / INERTIA
             angle += step * rate
     return angles, torques
@@ -54,24 +56,25 @@ def goal(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 def explained(
     kind: str, coulomb: float = 0.0, forwards: float = 0.0, backwards: float | None = None, gear: float = 0.0,
-    gain: float = 1.0, lag: float = 0.0,
+    gain: float = 1.0, lag: float = 0.0, stop: float = 0.0, turned: float = 1.0, inertia: float = 0.98 * INERTIA,
+    moment: float | None = 1.015 * MOMENT,
 ) -> tuple[dict[str, dict[str, float]], Explanation]:  # fmt: skip
     """Names with their numbers, and all that was found; there is an arm unless it turns."""
     rng = np.random.default_rng(5)
     wanted, arm = goal(kind, rng), 0.0 if kind == "turning" else MOMENT
-    given = (arm, coulomb, forwards, forwards if backwards is None else backwards, gear, gain, lag)
+    given = (arm, coulomb, forwards, forwards if backwards is None else backwards, gear, gain, lag, stop)
     angle, torque = servo(wanted, np.gradient(wanted, 1.0 / RATE), *given)
     recording = AxisRecording(
-        path=Path("servo"), time=np.arange(len(angle)) / RATE, position=np.round(angle / READ) * READ, velocity=None,
+        path=Path("servo"), time=np.arange(len(angle)) / RATE, position=turned * np.round(angle / READ) * READ, velocity=None,
         force=np.round((torque + 0.002 * rng.standard_normal(len(torque))) / 0.002) * 0.002,
         external_force=np.zeros(len(angle)), warnings=(),
     )  # fmt: skip
     description = {
         "format": "pcw_axis/1", "name": "servo", "kind": "rotary", "provenance": {"all": "made up"},
-        "columns": {"time": "t", "position": "q", "force": "tau"}, "inertia": 0.98 * INERTIA, "tolerances": {"inertia": "5 %"},
+        "columns": {"time": "t", "position": "q", "force": "tau"}, "inertia": inertia, "tolerances": {"inertia": "5 %"},
     }  # fmt: skip
-    if arm:
-        description["gravity_arm"] = {"moment": 1.015 * MOMENT, "hanging_position": 0.0}
+    if arm and moment is not None:
+        description["gravity_arm"] = {"moment": moment, "hanging_position": 0.0}
     builder = AxisProblemBuilder(parse_axis_description(description), [recording])
     found = explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
     return {n.term.effect: {k: e.value for k, e in n.estimates.items()} for n in found.named}, found
@@ -123,3 +126,47 @@ def test_a_motor_that_gives_less_than_it_is_told() -> None:
     names, _ = explained("sines", gain=0.7)
     assert names["torque_constant_error"]["error"] == pytest.approx(-0.3, abs=0.04)
     assert set(names) <= {"torque_constant_error", VISCOUS} and names.get(VISCOUS, {"viscous": 0.0})["viscous"] < 0.002
+
+
+def test_an_inertia_that_is_half_of_the_described_one_is_no_error_of_the_torque_constant() -> None:
+    """Which would relieve the inertia, and strain the arm's moment instead."""
+    names, found = explained("sines", coulomb=0.04, forwards=0.02, inertia=2.0 * INERTIA)
+    assert set(names) == {COULOMB, VISCOUS} and found.leftovers == ()
+    assert found.search.problem.remarks == ()
+    assert found.fit.mean[0] == pytest.approx(-INERTIA, rel=0.02)
+
+
+def test_frictions_show_beside_what_the_library_does_not_hold() -> None:
+    """Under the noise that an arm nobody described looks like, no friction is found."""
+    names, found = explained("sines", coulomb=0.04, forwards=0.02, moment=None)
+    assert set(names) == {COULOMB, VISCOUS} and [left.depends_on for left in found.leftovers] == [("position",)]
+    assert names[COULOMB]["coulomb"] == pytest.approx(0.04, rel=0.1)
+    assert names[VISCOUS]["viscous"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_what_only_relieves_numbers_beside_a_law_is_not_named() -> None:
+    """A stop on one side: numbers that mend its curve are strained, and a torque constant would take that from them."""
+    names, found = explained("sines", coulomb=0.03, stop=0.4)
+    assert set(names) == {COULOMB} and found.leftovers[0].depends_on == ("position",)
+    assert names[COULOMB]["coulomb"] == pytest.approx(0.03, rel=0.15)
+
+
+def test_signs_and_units_that_are_wrong_are_told() -> None:
+    """By the inertia that the force asks for."""
+    for turned, told in ((-1.0, "points the other way"), (180.0 / math.pi, "degrees for rad")):
+        _, found = explained("sines", coulomb=0.04, turned=turned)
+        [remark] = found.search.problem.remarks
+        assert told in remark and "inertia of 0.0196" not in remark.split(",")[0]
+
+
+def test_a_time_in_another_unit_is_refused() -> None:
+    """Milliseconds read as seconds are a sample every five seconds."""
+    rng = np.random.default_rng(0)
+    time, read = 5.0 * np.arange(2000.0), rng.standard_normal((2, 2000))
+    slow = AxisRecording(Path("slow.csv"), time, read[0], None, read[1], np.zeros(2000), ())
+    axis = parse_axis_description({
+        "format": "pcw_axis/1", "name": "servo", "kind": "rotary", "provenance": {"all": "made up"},
+        "columns": {"time": "t", "position": "q", "force": "tau"}, "inertia": INERTIA,
+    })  # fmt: skip
+    with pytest.raises(MismatchError, match=r"slow\.csv: 0\.2 samples a second by columns\.time"):
+        AxisProblemBuilder(axis, [slow])

@@ -566,7 +566,7 @@ def test_a_law_that_a_later_answer_does_without_is_not_told_and_gives_the_name_b
     """Two laws stood for a cogging that no candidate was; an effect in the second's place did without the first: an error."""
 
     def search_with(*effects: str) -> SimpleNamespace:
-        terms = [SimpleNamespace(effect=effect, target=("drive_torque/left",), arguments=("speed",)) for effect in effects]
+        terms = [SimpleNamespace(effect=effect, law=of_speed if effect == UNKNOWN else None) for effect in effects]
         problem = SimpleNamespace(sites=object(), terms=terms, nuisances=())
         return SimpleNamespace(problem=problem, label=lambda instance: effects[instance.term], progress=lambda said: None)
 
@@ -575,8 +575,8 @@ def test_a_law_that_a_later_answer_does_without_is_not_told_and_gives_the_name_b
         return SimpleNamespace(fit=fit, threshold=3.0)
 
     name, other, law = (Instance(k, (), (0,)) for k in range(3))
-    plain, wider = search_with("friction", "cogging"), search_with("friction", "cogging", UNKNOWN)
     of_speed = SimpleNamespace(sites=("drive_torque/left",), depends_on=("speed",))
+    plain, wider = search_with("friction", "cogging"), search_with("friction", "cogging", UNKNOWN)
     found = SimpleNamespace(law=of_speed, counts=True, withdrawn=(name,), names=())
     left = open_set.OpenSetResult((SimpleNamespace(),), (), np.zeros(1))  # type: ignore[arg-type]
     listed = iter([None, chosen(name, other), None])
@@ -584,6 +584,8 @@ def test_a_law_that_a_later_answer_does_without_is_not_told_and_gives_the_name_b
     monkeypatch.setattr(open_set, "LawSearch", lambda search, selection: SimpleNamespace(run=lambda: next(laws)))
     monkeypatch.setattr(open_set, "_in_library", lambda search, selection, law: next(listed))
     monkeypatch.setattr(open_set, "_adopted", lambda search, selection, how: (wider, chosen(law), of_speed))
+    monkeypatch.setattr(open_set, "_with_names_beside", lambda search, selection: selection)
+    monkeypatch.setattr(open_set, "_without_mere_relief", lambda search, selection: selection)
     monkeypatch.setattr(open_set, "OpenSetTest", lambda search, i: SimpleNamespace(run=lambda threshold: left))
     monkeypatch.setattr(open_set, "shared_beliefs", lambda search, selection: {})
     judged = open_set.judge(plain, chosen(name), left)  # type: ignore[arg-type]

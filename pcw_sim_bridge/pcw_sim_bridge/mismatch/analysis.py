@@ -446,6 +446,8 @@ def _far_off(number: RetunedFinding) -> str:
     late = f"{1e3 * abs(number.value):.2g} ms {'later' if number.value < 0.0 else 'earlier'}"
     if number.name == TORQUE_LAG:
         return f"{far} off: torques act {late} than joint_states report them. The fit allows for it."
+    if number.name == "clock_offset":
+        return f"{far} off: the force acts {late} than it is recorded, by the motor or by a filter. The fit allows for it."
     if number.name == "heading_lead":
         return f"{far} off: wheels follow their headings {late} than rigid ones do. The fit allows for it."
     return f"{far} from the description: check it or its tolerance."

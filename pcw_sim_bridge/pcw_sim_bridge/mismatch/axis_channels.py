@@ -50,6 +50,10 @@ PREFILTER_RATIO = 2.5
 # The noise that differentiation puts into the inertial force may reach this part of the measured force.
 ALLOWED_DERIVATIVE_NOISE = 0.05
 SHORTEST_SEGMENT = 1.0  # [s]
+LEAST_RATE = 10.0  # [Hz]; of fewer samples no derivative is one of a drive
+# An inertia of so many times the described one, or of so small a part, is a unit that is wrong, if the described one leaves so
+# many times the squares; so one of the other sign is.
+MISTAKEN, MISTAKEN_SQUARES = 3.0, 2.0
 LARGEST_ORDER_GRID = 1500
 # Coggings that count as known when a force is predicted or the smoothing chosen: so many, each explaining such a part of
 # what the others leave, and such a part of the measured force.
@@ -159,6 +163,11 @@ class AxisProblemBuilder:
         for recording in recordings:
             if not np.any(recording.force + recording.external_force):
                 raise MismatchError(f"{recording.path}: the force is 0 throughout; allowed: a drive that works")
+            rate = 1.0 / float(np.median(np.diff(recording.time)))
+            if rate < LEAST_RATE:
+                raise MismatchError(
+                    f"{recording.path}: {rate:.3g} samples a second by columns.time or rate; allowed: {LEAST_RATE:g} and more"
+                )
         self.axis, self.recordings = axis, tuple(recordings)
         self.cutoff = cutoff if cutoff is not None else choose_cutoff(axis, recordings)
         rates_and_motions = [
@@ -385,7 +394,29 @@ class AxisProblemBuilder:
             variables=variables,
             sites=self._sites(start, smoothing),
             exact=functools.partial(self._residual_of_clocks, predicted),
+            remarks=self._mistaken_units(),
         )
+
+    def _mistaken_units(self) -> tuple[str, ...]:
+        """Say so where the force asks for an inertia of the other sign or of another order of magnitude."""
+        if not self._valid.any():
+            return ()
+        velocity, (acceleration, force) = self._variables["velocity"], (self._acceleration, self._force)
+        friction = np.tanh(velocity / (0.02 * max(float(np.quantile(np.abs(velocity), 0.99)), 1e-12)))
+        others = [velocity, friction, np.ones_like(velocity), *self._gravity()]
+        left, fixed = [], force - self.axis.inertia * acceleration
+        for known, target in ((others, fixed), ([*others, acceleration], force)):
+            columns = np.stack(known, axis=1)[self._valid]
+            size = np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-300)
+            solution = np.linalg.lstsq(columns / size, target[self._valid], rcond=1e-9)[0] / size
+            left.append(float(np.sum((target[self._valid] - columns @ solution) ** 2)))
+        ratio, unit = float(solution[-1]) / self.axis.inertia, self.axis.unit("kg m^2")
+        if left[0] < MISTAKEN_SQUARES * left[1] or 1.0 / MISTAKEN < ratio < MISTAKEN:
+            return ()
+        asked = f"The force asks for an inertia of {solution[-1]:.3g} {unit}, and the description has {self.axis.inertia:.3g}:"
+        if ratio < -1.0 / MISTAKEN:
+            return (f"{asked} force or position points the other way; turn one round by the sign of its scale in columns.",)
+        return (f"{asked} check the units in columns (degrees for rad are 57.3, ms for s a million) and the inertia.",)
 
     def _residual_of_clocks(
         self, predicted: FloatArray, changes: Mapping[str, float], sizes: Sequence[SizedTerm]

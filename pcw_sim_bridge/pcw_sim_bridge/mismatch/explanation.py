@@ -248,25 +248,22 @@ def search_effects(
     """Search, and once more with narrower tolerances where numbers come out as no healthy robot's do.
 
     A number that strains its tolerance costs less than an effect has to explain: a payload hides behind a mass that is off by
-    ten times what it may be. What is found counts if it relieves the numbers, and explains more than what was found before.
+    ten times what it may be. What is found counts if it relieves the numbers, and strains no others instead, and explains more
+    than what was found before.
     Fewer effects count also if they explain hardly less: what undoes effects that are too large fits the model's own errors.
     """
     search = EffectSearch(problem, rng, settings, progress)
     selection = search.run()
-    strains = _strains(search.problem, selection.fit)
-    loose = {number.name for number in problem.nuisances if number.loose}
-    strained = {
-        name: strain for name, strain in strains.items()
-        if name not in HIDES_NOTHING and strain > (LOOSE_STRAINED if name in loose else STRAINED)
-    }  # fmt: skip
+    strained = _strained(problem, selection.fit)
     if not strained:
         return search, selection
     progress(f"once more with narrower tolerances of {', '.join(strained)}")
     firm = problem.narrowed({name: HEALTHY / strain for name, strain in strained.items()})
     again = EffectSearch(firm, rng, settings, progress)
     instead = again.run()
-    here, there = (_strains(firm, fit) for fit in (selection.fit, instead.fit))
-    relief = sum(there[name] ** 2 for name in strained) / sum(here[name] ** 2 for name in strained)
+    here, there = (_strains(problem, fit) for fit in (selection.fit, instead.fit))
+    looked_at = strained.keys() | _strained(problem, instead.fit).keys()
+    relief = sum(there[name] ** 2 for name in looked_at) / sum(here[name] ** 2 for name in looked_at)
     gain = again.advantage(instead, selection.fit.instances)
     progress(f"strains left {relief:.2f} of them, {gain:.1f} nats more")
     fewer = len(instead.fit.instances) < len(selection.fit.instances)
@@ -279,6 +276,13 @@ def search_effects(
 def _strains(problem: RegressionProblem, fit: Fit) -> dict[str, float]:
     """By how many tolerances the numbers of the description come out of it."""
     return {n.name: abs(float(mean)) / n.deviation for n, mean in zip(problem.nuisances, fit.mean, strict=False)}
+
+
+def _strained(problem: RegressionProblem, fit: Fit) -> dict[str, float]:
+    """Those of numbers that come out as no healthy robot's do, and behind which an effect may hide."""
+    most = {number.name: LOOSE_STRAINED if number.loose else STRAINED for number in problem.nuisances}
+    strains = _strains(problem, fit).items()
+    return {name: strain for name, strain in strains if name not in HIDES_NOTHING and strain > most[name]}
 
 
 def _telling(search: EffectSearch, selection: Selection) -> tuple[Selection, tuple[NamedTerm, ...]]:

@@ -160,7 +160,7 @@ def _serve(connection: Connection, of_others: Sequence[Connection]) -> None:
     while True:
         try:
             function, arguments = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
         try:
             result = function(*arguments)

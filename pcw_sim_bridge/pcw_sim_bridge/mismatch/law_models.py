@@ -33,7 +33,7 @@ class LawModels:
             term = terms[instance.term]
             is_law = term.effect == UNKNOWN and instance not in refused
             for left in explanation.leftovers if is_law else ():
-                if left.law is None or (left.law.sites, left.law.depends_on) != (term.target, term.arguments):
+                if left.law is None or term.law is not left.law:
                     continue
                 self.laws[instance] = left.law
                 taken = [*all_effects(), *(made.name for made in self._made.values())]

@@ -146,6 +146,7 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
             continue
         before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
         search, selection, final = _adopted(search, selection, law)
+        selection = _without_mere_relief(search, _with_names_beside(search, selection))
         after = {i.term for i in selection.fit.instances}
         withdrawn += [(search.label(i), final.depends_on[0]) for i in before if i.term not in after]
         found.append((final, law))
@@ -251,6 +252,39 @@ def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> 
             search.progress(f"in the library after all: {search.label(trial[-1])}")
             return chosen
     return None
+
+
+def _with_names_beside(search: EffectSearch, selection: Selection) -> Selection:
+    """The selection with effects that only show under what a law leaves, beside names or in place of some; with the law.
+
+    Before, all that the law explains was noise to them: one that does a little of its work was named, and none of the others.
+    """
+    instances = selection.fit.instances
+    grown = search.grow(selection.regression, search.improve(selection.regression, instances), selection.threshold)
+    if {i.term for i in grown} == {i.term for i in instances}:
+        return selection
+    chosen = search.prune(search.whiten_beside(grown), grown, selection.threshold)
+    laws = {i for i in instances if is_unknown(search.problem, i)}
+    gain = chosen.fit.log_evidence - chosen.regression.fit(instances).log_evidence
+    return chosen if laws <= set(chosen.fit.instances) and gain > selection.threshold else selection
+
+
+def _without_mere_relief(search: EffectSearch, selection: Selection) -> Selection:
+    """The selection, with a law, without effects that take a strain from the description's numbers and explain nothing more.
+
+    It is what nobody knows that strains them: a number may mend what a law does not do quite right.
+    """
+    regression, fit = selection.regression, selection.fit
+    for index, instance in enumerate(fit.instances):
+        if is_unknown(search.problem, instance):
+            continue
+        rest = regression.fit(fit.instances[:index] + fit.instances[index + 1 :])
+        relief = regression.tolerance_cost(rest) - regression.tolerance_cost(fit)
+        loss = fit.log_evidence - rest.log_evidence
+        if relief > 0.0 and loss - relief < selection.threshold:
+            search.note_drop(search.label(instance), loss, "beside the law it does no more than relieve numbers")
+            return _without_mere_relief(search, search.prune(regression, rest.instances, selection.threshold))
+    return selection
 
 
 def _adopted(search: EffectSearch, selection: Selection, found: FoundLaw) -> tuple[EffectSearch, Selection, Law]:
@@ -383,22 +417,16 @@ def _weights_of(search: EffectSearch, selection: Selection, law: Law) -> tuple[F
     position = len(search.problem.nuisances)
     for instance in selection.fit.instances:
         count = len(instance.active)
-        if _is_of(search.problem, instance, law):
+        if search.problem.terms[instance.term].law is law:
             rows = slice(position, position + count)
             return selection.fit.mean[rows], selection.fit.covariance[rows, rows]
         position += count
     raise AssertionError("the law is in the fit")
 
 
-def _is_of(problem: RegressionProblem, instance: Instance, law: Law) -> bool:
-    """Whether an instance is a law."""
-    term = problem.terms[instance.term]
-    return is_unknown(problem, instance) and term.target == law.sites and term.arguments == law.depends_on
-
-
 def _is_fitted(search: EffectSearch, selection: Selection, law: Law) -> bool:
     """Whether a law is in the joint fit."""
-    return any(_is_of(search.problem, instance, law) for instance in selection.fit.instances)
+    return any(search.problem.terms[instance.term].law is law for instance in selection.fit.instances)
 
 
 def _law_leftover(search: EffectSearch, selection: Selection, law: Law, found: FoundLaw) -> Leftover:

@@ -170,6 +170,7 @@ class Term:
             that the model misjudges.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
         recording: the only one in which it is at work; None: it is in all, at the same time.
+        law: the very law outside the library that it is, of which there may be several of the same arguments; None of effects.
         headed: changes of the nuisances by name -> its columns where these turn, or tilt, what it is a function of; None where
             they hardly do. None where it is a function of nothing that is re-tuned.
     """
@@ -199,6 +200,7 @@ class Term:
     unlike_errors: bool = False
     once: bool = False
     recording: int | None = None
+    law: object | None = None
     headed: Callable[[Mapping[str, float]], Callable[[Shape], FloatArray] | None] | None = None
 
     @property

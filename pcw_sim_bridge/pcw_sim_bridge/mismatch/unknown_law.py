@@ -186,6 +186,7 @@ class Law:
             columns=lambda shape: columns,
             arguments=self.depends_on,
             log_prior=self.log_prior,
+            law=self,
         )
 
 
