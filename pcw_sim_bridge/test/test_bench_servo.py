@@ -6,12 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pcw_description.axis_recording import AxisRecording, parse_axis_description
+from pcw_description.axis_recording import AxisDescription, AxisRecording, parse_axis_description
 from pcw_description.compiled import compiled
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
+from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.explanation import Explanation, explain
+from pcw_sim_bridge.mismatch.findings import InputFinding
 from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
+from pcw_sim_bridge.mismatch.subject import Opened
 
 VISCOUS, COULOMB, GEAR = "drive_viscous_friction", "drive_coulomb_friction", "load_dependent_friction"
 INERTIA, MOMENT, RATE, SUBSTEPS = 0.02, 0.6, 200.0, 50
@@ -54,12 +57,12 @@ def goal(kind: str, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(sum(size * (np.sin(2.0 * np.pi * f * time + phase) - np.sin(phase)) for size, f, phase in waves))
 
 
-def explained(
+def recorded(
     kind: str, coulomb: float = 0.0, forwards: float = 0.0, backwards: float | None = None, gear: float = 0.0,
     gain: float = 1.0, lag: float = 0.0, stop: float = 0.0, turned: float = 1.0, inertia: float = 0.98 * INERTIA,
     moment: float | None = 1.015 * MOMENT,
-) -> tuple[dict[str, dict[str, float]], Explanation]:  # fmt: skip
-    """Names with their numbers, and all that was found; there is an arm unless it turns."""
+) -> tuple[AxisDescription, AxisRecording]:  # fmt: skip
+    """The description and a recording; there is an arm unless it turns."""
     rng = np.random.default_rng(5)
     wanted, arm = goal(kind, rng), 0.0 if kind == "turning" else MOMENT
     given = (arm, coulomb, forwards, forwards if backwards is None else backwards, gear, gain, lag, stop)
@@ -75,7 +78,13 @@ def explained(
     }  # fmt: skip
     if arm and moment is not None:
         description["gravity_arm"] = {"moment": moment, "hanging_position": 0.0}
-    builder = AxisProblemBuilder(parse_axis_description(description), [recording])
+    return parse_axis_description(description), recording
+
+
+def explained(kind: str, **truth: float | None) -> tuple[dict[str, dict[str, float]], Explanation]:
+    """Names with their numbers, and all that was found."""
+    axis, recording = recorded(kind, **truth)  # type: ignore[arg-type]
+    builder = AxisProblemBuilder(axis, [recording])
     found = explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
     return {n.term.effect: {k: e.value for k, e in n.estimates.items()} for n in found.named}, found
 
@@ -119,6 +128,22 @@ def test_a_motor_that_is_late_by_samples() -> None:
     assert set(names) == {COULOMB} and names[COULOMB]["coulomb"] == pytest.approx(0.04, rel=0.1)
     offset = [n.name for n in found.search.problem.nuisances].index("clock_offset")
     assert found.fit.mean[offset] == pytest.approx(-0.0225, abs=0.003)  # a command is held for half a sample, besides
+
+
+def test_a_force_that_acts_much_later_is_put_back() -> None:
+    """From far off no slope leads there. Said of every recording of the analysis."""
+    for lag, late in ((0.0, None), (0.04, 35.0)):
+        axis, recording = recorded("sines", coulomb=0.05, forwards=0.02, lag=lag)
+        subject = AxisSubject(axis)
+        opened = [Opened(recording, InputFinding("servo", "", 60.0, role, ())) for role in ("fit", "holdout")]
+        right = subject.put_right(subject.problem(opened[:1]), opened)
+        if late is None:
+            assert right is opened
+            continue
+        for one in right:
+            assert one.finding.warnings[-1].startswith(f"the force acts about {late:.0f} ms later than recorded")
+            expected = np.interp(recording.time - 1e-3 * late, recording.time, recording.force)
+            np.testing.assert_allclose(one.recording.force, expected, atol=1e-12)
 
 
 def test_a_motor_that_gives_less_than_it_is_told() -> None:

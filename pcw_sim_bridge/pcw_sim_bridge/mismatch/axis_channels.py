@@ -51,6 +51,9 @@ PREFILTER_RATIO = 2.5
 ALLOWED_DERIVATIVE_NOISE = 0.05
 SHORTEST_SEGMENT = 1.0  # [s]
 LEAST_RATE = 10.0  # [Hz]; of fewer samples no derivative is one of a drive
+# A force is looked for so much later and earlier than it is recorded [s], in so many steps to either side; it is taken to be
+# there if that leaves no more than this part of the squares.
+LARGEST_DELAY, DELAYS, DELAYED_SQUARES = 0.08, 16, 0.8
 # An inertia of so many times the described one, or of so small a part, is a unit that is wrong, if the described one leaves so
 # many times the squares; so one of the other sign is.
 MISTAKEN, MISTAKEN_SQUARES = 3.0, 2.0
@@ -397,6 +400,28 @@ class AxisProblemBuilder:
             remarks=self._mistaken_units(),
         )
 
+    def _force_of(self, late: float) -> FloatArray:
+        """The measured force (T,), put back by so much to when it acted [s]."""
+        return self._filtered([np.interp(m.time + late, m.time, m.force) for m in self.motions])
+
+    def delay(self) -> float:
+        """By how much the force is recorded later than it acts [s], roughly; 0 where that explains little.
+
+        From far off no slope leads there, and beside a delay what is missing of friction looks like less of it.
+        """
+        if not self._valid.any():
+            return 0.0
+        top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.99)), 1e-12)
+        signs = self._filtered([np.tanh(m.velocity / (0.02 * top)) for m in self.motions])
+        columns = [self._acceleration, self._variables["velocity"], signs, np.ones_like(signs), *self._gravity()]
+        known, _ = np.linalg.qr(np.concatenate([np.stack(columns, axis=1), *self._periodic_columns], axis=1)[self._valid])
+        left: dict[float, float] = {}
+        for late in np.linspace(-LARGEST_DELAY, LARGEST_DELAY, 2 * DELAYS + 1).tolist():
+            force = self._force_of(late)[self._valid]
+            left[late] = float(np.sum((force - known @ (known.T @ force)) ** 2))
+        best = min(left, key=lambda late: left[late])
+        return best if left[best] < DELAYED_SQUARES * left[0.0] else 0.0
+
     def _mistaken_units(self) -> tuple[str, ...]:
         """Say so where the force asks for an inertia of the other sign or of another order of magnitude."""
         if not self._valid.any():
@@ -425,9 +450,7 @@ class AxisProblemBuilder:
 
         All else is linear; a clock or a motor that is late by more than a sample is not, where frictions change their sign.
         """
-        late = changes["clock_offset"]
-        acted = [np.interp(m.time + late, m.time, m.force) for m in self.motions]
-        return (self._filtered(acted) - predicted)[:, None], ["clock_offset"]
+        return (self._force_of(changes["clock_offset"]) - predicted)[:, None], ["clock_offset"]
 
     @functools.cached_property
     def _travels(self) -> list[FloatArray]:

@@ -22,7 +22,7 @@ from pcw_description.effects.registry import get
 from .axis_channels import AxisProblemBuilder
 from .axis_rollout import axis_windows, rollout_floor, rollout_squares
 from .findings import InputFinding
-from .regression_problem import FloatArray, RegressionProblem
+from .regression_problem import HEALTHY, FloatArray, RegressionProblem
 from .ripple_sizes import RippleSize
 from .rollout import Windows
 from .subject import Opened, file_digest
@@ -68,8 +68,20 @@ class AxisSubject:
         return builder.build(self._smoothing)
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
-        """Return the recordings as they are: their description says in which units."""
-        return opened
+        """Return the recordings with forces put back in time, with a warning, where they act at another time than recorded."""
+        fitted = [one.recording for one in opened if one.finding.role == "fit"]
+        builder = AxisProblemBuilder(self.axis, fitted, self._cutoff)
+        late, tolerance = builder.delay(), next(n.deviation for n in problem.nuisances if n.name == "clock_offset")
+        if abs(late) < HEALTHY * tolerance:
+            return opened
+        when = "earlier" if late > 0.0 else "later"
+        warning = f"the force acts about {1e3 * abs(late):.0f} ms {when} than recorded, by the motor or a filter; put back"
+        right = []
+        for one in opened:
+            acted = np.interp(one.recording.time + late, one.recording.time, one.recording.force)
+            finding = dataclasses.replace(one.finding, warnings=(*one.finding.warnings, warning))
+            right.append(Opened(dataclasses.replace(one.recording, force=acted), finding))
+        return right
 
     def turned_steering(self, problem: RegressionProblem, opened: Sequence[Opened]) -> None:
         """Return None: an axis has none."""
