@@ -132,8 +132,8 @@ def test_a_motor_that_is_late_by_samples() -> None:
 
 def test_a_force_that_acts_much_later_is_put_back() -> None:
     """From far off no slope leads there. Said of every recording of the analysis."""
-    for lag, late in ((0.0, None), (0.04, 35.0)):
-        axis, recording = recorded("sines", coulomb=0.05, forwards=0.02, lag=lag)
+    for kind, gear, lag, late in (("sines", 0.0, 0.0, None), ("turning", 0.2, 0.0, None), ("sines", 0.0, 0.04, 35.0)):
+        axis, recording = recorded(kind, coulomb=0.05, forwards=0.02, gear=gear, lag=lag)
         subject = AxisSubject(axis)
         opened = [Opened(recording, InputFinding("servo", "", 60.0, role, ())) for role in ("fit", "holdout")]
         right = subject.put_right(subject.problem(opened[:1]), opened)

@@ -52,8 +52,8 @@ ALLOWED_DERIVATIVE_NOISE = 0.05
 SHORTEST_SEGMENT = 1.0  # [s]
 LEAST_RATE = 10.0  # [Hz]; of fewer samples no derivative is one of a drive
 # A force is looked for so much later and earlier than it is recorded [s], in so many steps to either side; it is taken to be
-# there if that leaves no more than this part of the squares.
-LARGEST_DELAY, DELAYS, DELAYED_SQUARES = 0.08, 16, 0.8
+# there if that leaves no more than this part of the squares. A friction that nobody described leaves more than half.
+LARGEST_DELAY, DELAYS, DELAYED_SQUARES = 0.08, 16, 0.35
 # An inertia of so many times the described one, or of so small a part, is a unit that is wrong, if the described one leaves so
 # many times the squares; so one of the other sign is.
 MISTAKEN, MISTAKEN_SQUARES = 3.0, 2.0
@@ -412,8 +412,10 @@ class AxisProblemBuilder:
         if not self._valid.any():
             return 0.0
         top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.99)), 1e-12)
-        signs = self._filtered([np.tanh(m.velocity / (0.02 * top)) for m in self.motions])
-        columns = [self._acceleration, self._variables["velocity"], signs, np.ones_like(signs), *self._gravity()]
+        signs = [np.tanh(m.velocity / (0.02 * top)) for m in self.motions]
+        loads = [np.abs(force) * sign for force, sign in zip(self._smooth_forces, signs, strict=True)]
+        columns = [self._filtered(frictions) for frictions in (signs, loads)]
+        columns += [self._acceleration, self._variables["velocity"], np.ones(len(self._valid)), *self._gravity()]
         known, _ = np.linalg.qr(np.concatenate([np.stack(columns, axis=1), *self._periodic_columns], axis=1)[self._valid])
         left: dict[float, float] = {}
         for late in np.linspace(-LARGEST_DELAY, LARGEST_DELAY, 2 * DELAYS + 1).tolist():
