@@ -1,13 +1,16 @@
 """Servos as people have them: read in coarse steps, without a speed, commanded late; simulated by laws written out here."""
 
+import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pcw_description.axis_recording import AxisDescription, AxisRecording, parse_axis_description
 from pcw_description.compiled import compiled
+from pcw_sim_bridge.mismatch import open_set
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
 from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.errors import MismatchError
@@ -15,6 +18,7 @@ from pcw_sim_bridge.mismatch.explanation import Explanation, explain
 from pcw_sim_bridge.mismatch.findings import InputFinding
 from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
 from pcw_sim_bridge.mismatch.subject import Opened
+from pcw_sim_bridge.mismatch.whitened_regression import Instance
 
 VISCOUS, COULOMB, GEAR = "drive_viscous_friction", "drive_coulomb_friction", "load_dependent_friction"
 INERTIA, MOMENT, RATE, SUBSTEPS = 0.02, 0.6, 200.0, 50
@@ -195,3 +199,43 @@ def test_a_time_in_another_unit_is_refused() -> None:
     })  # fmt: skip
     with pytest.raises(MismatchError, match=r"slow\.csv: 0\.2 samples a second by columns\.time"):
         AxisProblemBuilder(axis, [slow])
+
+
+def test_a_speed_that_is_recorded_is_judged_by_its_own_noise() -> None:
+    """Not by the steps of the position beside it, by which the axis would seem to stand still all the time."""
+    axis, recording = recorded("sines", coulomb=0.04, forwards=0.02)
+    rng = np.random.default_rng(1)
+    speed = np.gradient(recording.position, 1.0 / RATE)
+    smooth = np.convolve(speed, np.ones(9) / 9.0, "same") + 1e-3 * rng.standard_normal(len(speed))
+    coarse = np.round(recording.position / (4.0 * READ)) * 4.0 * READ
+    builder = AxisProblemBuilder(axis, [dataclasses.replace(recording, position=coarse, velocity=smooth)])
+    problem = builder.build(builder.choose_smoothing())
+    assert problem.valid.mean() > 0.9
+
+
+def test_what_is_a_function_of_a_law_s_own_arguments_is_not_named_beside_it() -> None:
+    """A gear that rubs by the weight on its far side is a law of angle and speed, which holds all frictions by the speed."""
+    problem = SimpleNamespace(terms=[
+        SimpleNamespace(effect="load_dependent_friction", arguments=("velocity", "force")),
+        SimpleNamespace(effect="unknown", arguments=("position", "velocity")),
+        SimpleNamespace(effect="drive_stribeck_friction", arguments=("velocity",)),
+        SimpleNamespace(effect="constant_load", arguments=()),
+    ])  # fmt: skip
+    name, law, mends, another = (Instance(k, (), (0,)) for k in range(4))
+    fitted: list[tuple[Instance, ...]] = []
+
+    def chosen(instances: tuple[Instance, ...]) -> SimpleNamespace:
+        fitted.append(instances)
+        fit = SimpleNamespace(instances=instances, log_evidence=10.0 * len(instances))
+        return SimpleNamespace(
+            fit=fit, threshold=3.0, regression=SimpleNamespace(fit=lambda own: SimpleNamespace(log_evidence=10.0 * len(own)))
+        )
+
+    for grown, wanted in (((name, law, mends), (name, law)), ((name, law, mends, another), (name, law, another))):
+        search = SimpleNamespace(
+            problem=problem, grow=lambda regression, instances, least, grown=grown: grown,
+            improve=lambda regression, instances: instances, whiten_beside=lambda instances: None,
+            prune=lambda regression, instances, threshold: chosen(instances),
+        )  # fmt: skip
+        found = open_set._with_names_beside(search, chosen((name, law)))  # type: ignore[arg-type]
+        assert found.fit.instances == wanted

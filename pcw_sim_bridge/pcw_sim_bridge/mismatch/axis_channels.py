@@ -34,7 +34,14 @@ from .regression_problem import (
     SizedTerm,
     Term,
 )
-from .signal_filter import SignalFilter, derivative, reading_noise_level, refined, uniform_segments
+from .signal_filter import (
+    SignalFilter,
+    derivative,
+    reading_noise_level,
+    refined,
+    uniform_segments,
+    white_noise_level,
+)
 from .unknown_law import TRAVEL
 
 LARGEST_CUTOFF = (
@@ -110,9 +117,12 @@ def axis_motion(
     signals = np.stack([recording.position, velocity, recording.force + recording.external_force], axis=1)
     rate, pieces = uniform_segments(recording.time, signals, largest_gap=0.02)
     wide = SignalFilter(rate, PREFILTER_RATIO * cutoff)
-    noise = reading_noise_level(recording.position)
-    # Deviation of the velocity of a noisy position after the wide filter.
-    creep = noise * np.sqrt(2.0 / rate * (2.0 * np.pi) ** 2 * min(wide.cutoff, 0.5 * rate) ** 3 / 3.0)
+    # Deviation of the velocity after the wide filter: of what is read of it, or of a noisy position.
+    band = min(wide.cutoff, 0.5 * rate)
+    if recording.velocity is not None:
+        creep = white_noise_level(recording.velocity) * np.sqrt(2.0 / rate * band)
+    else:
+        creep = reading_noise_level(recording.position) * np.sqrt(2.0 / rate * (2.0 * np.pi) ** 2 * band**3 / 3.0)
     factor = max(1, math.ceil(FINE_SAMPLES_PER_CUTOFF * cutoff / rate))
     motions = []
     for stamps, values in pieces:

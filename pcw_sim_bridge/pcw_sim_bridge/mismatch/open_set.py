@@ -260,11 +260,17 @@ def _with_names_beside(search: EffectSearch, selection: Selection) -> Selection:
     Before, all that the law explains was noise to them: one that does a little of its work was named, and none of the others.
     """
     instances = selection.fit.instances
+    laws = {i for i in instances if is_unknown(search.problem, i)}
     grown = search.grow(selection.regression, search.improve(selection.regression, instances), selection.threshold)
+    # What is a function of a law's own arguments mends the law; a constant is none.
+    terms, held = search.problem.terms, [set(search.problem.terms[law.term].arguments) for law in laws]
+    grown = tuple(
+        i for i in grown
+        if i in instances or not terms[i.term].arguments or not any(set(terms[i.term].arguments) <= own for own in held)
+    )  # fmt: skip
     if {i.term for i in grown} == {i.term for i in instances}:
         return selection
     chosen = search.prune(search.whiten_beside(grown), grown, selection.threshold)
-    laws = {i for i in instances if is_unknown(search.problem, i)}
     gain = chosen.fit.log_evidence - chosen.regression.fit(instances).log_evidence
     return chosen if laws <= set(chosen.fit.instances) and gain > selection.threshold else selection
 
