@@ -72,7 +72,7 @@ class AxisSubject:
         fitted = [one.recording for one in opened if one.finding.role == "fit"]
         builder = AxisProblemBuilder(self.axis, fitted, self._cutoff)
         late, tolerance = builder.delay(), next(n.deviation for n in problem.nuisances if n.name == "clock_offset")
-        if abs(late) < HEALTHY * tolerance:
+        if abs(late) <= HEALTHY * tolerance:
             return opened
         when = "earlier" if late > 0.0 else "later"
         warning = f"the force acts about {1e3 * abs(late):.0f} ms {when} than recorded, by the motor or a filter; put back"
