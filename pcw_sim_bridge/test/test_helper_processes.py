@@ -116,6 +116,16 @@ def test_on_one_core_all_is_done_here(tmp_path: Path, monkeypatch: pytest.Monkey
         assert helpers.do([(process_of, (1,))]) == [(1, os.getpid())]
 
 
+def test_where_no_process_can_be_forked_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> int:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    monkeypatch.setattr(os, "fork", refuse)
+    with HelperProcesses() as helpers:
+        assert helpers.do([(process_of, (1,))]) == [(1, os.getpid())]
+
+
 def test_a_decoded_recording_is_small(tmp_path: Path) -> None:
     """It is sent from process to process: most of what is read from files is what the series were decoded from."""
     whole = Recording.open(bag(tmp_path / "run", 400), THESIS)

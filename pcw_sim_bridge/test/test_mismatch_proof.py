@@ -644,7 +644,7 @@ def test_a_small_law_that_other_data_contradict_is_no_finding(
     monkeypatch.setattr(law_models, "generate", no_kernel)
     monkeypatch.setattr(proof, "_times_floor", lambda *rest: times_floor)
     law = SimpleNamespace(sites=("drive_torque/left",), depends_on=("speed",))
-    term = SimpleNamespace(effect=UNKNOWN, target=law.sites, arguments=law.depends_on)
+    term = SimpleNamespace(effect=UNKNOWN, target=law.sites, arguments=law.depends_on, law=law)
     label = "unknown/drive_torque/left by speed"
     search = SimpleNamespace(problem=SimpleNamespace(terms=(term,)), label=lambda instance: label)
     selection = SimpleNamespace(fit=SimpleNamespace(instances=(Instance(0, (), (0,)),)))

@@ -31,7 +31,6 @@ from .regression_problem import (
     RegressionProblem,
     Shape,
     Sites,
-    SizedTerm,
     Term,
 )
 from .signal_filter import (
@@ -254,6 +253,10 @@ class AxisProblemBuilder:
         size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
         solution, *_ = np.linalg.lstsq(stacked / size, force, rcond=1e-8)
         scaled = solution / size
+        if in_channel:
+            # Frictions and loads are free to be as large as the error makes them. What there seems to be of them where a force
+            # is late by half a sample is none, and would tell how large the error is.
+            scaled[1:4] = 0.0
         return [part @ scaled for part in parts]
 
     def choose_smoothing(self) -> float:
@@ -406,13 +409,8 @@ class AxisProblemBuilder:
             terms=tuple(terms),
             variables=variables,
             sites=self._sites(start, smoothing),
-            exact=functools.partial(self._residual_of_clocks, predicted),
             remarks=self._mistaken_units(),
         )
-
-    def _force_of(self, late: float) -> FloatArray:
-        """The measured force (T,), put back by so much to when it acted [s]."""
-        return self._filtered([np.interp(m.time + late, m.time, m.force) for m in self.motions])
 
     def delay(self) -> float:
         """By how much the force is recorded later than it acts [s], roughly; 0 where that explains little.
@@ -429,7 +427,7 @@ class AxisProblemBuilder:
         known, _ = np.linalg.qr(np.concatenate([np.stack(columns, axis=1), *self._periodic_columns], axis=1)[self._valid])
         left: dict[float, float] = {}
         for late in np.linspace(-LARGEST_DELAY, LARGEST_DELAY, 2 * DELAYS + 1).tolist():
-            force = self._force_of(late)[self._valid]
+            force = self._filtered([np.interp(m.time + late, m.time, m.force) for m in self.motions])[self._valid]
             left[late] = float(np.sum((force - known @ (known.T @ force)) ** 2))
         best = min(left, key=lambda late: left[late])
         return best if left[best] < DELAYED_SQUARES * left[0.0] else 0.0
@@ -454,15 +452,6 @@ class AxisProblemBuilder:
         if ratio < -1.0 / MISTAKEN:
             return (f"{asked} force or position points the other way; turn one round by the sign of its scale in columns.",)
         return (f"{asked} check the units in columns (degrees for rad are 57.3, ms for s a million) and the inertia.",)
-
-    def _residual_of_clocks(
-        self, predicted: FloatArray, changes: Mapping[str, float], sizes: Sequence[SizedTerm]
-    ) -> tuple[FloatArray, Sequence[str]]:
-        """Residual (T, 1) with the force put back to when it acted, and that this is what it holds of the changes.
-
-        All else is linear; a clock or a motor that is late by more than a sample is not, where frictions change their sign.
-        """
-        return (self._force_of(changes["clock_offset"]) - predicted)[:, None], ["clock_offset"]
 
     @functools.cached_property
     def _travels(self) -> list[FloatArray]:
@@ -510,13 +499,11 @@ class AxisProblemBuilder:
         fixed |= {SMOOTHING: smoothing} if SMOOTHING in fixed else {}
         shapes: list[dict[str, float]] = [dict(fixed)]
         resolution: dict[str, tuple[str, float]] = {}
-        periodic, most = None, {}
+        periodic = None
         for parameter in effect.nonlinear_parameters:
             if parameter.name in fixed:
                 continue
             grid, kind, step = self._shape_grid(parameter)
-            if parameter.unit == "rad/s":
-                most[parameter.name] = float(np.max(np.abs(self._variables["velocity"])))
             resolution[parameter.name] = (kind, step)
             shapes = [{**shape, parameter.name: float(value)} for shape in shapes for value in grid]
             if kind == "linear":
@@ -543,7 +530,6 @@ class AxisProblemBuilder:
             repeatable=periodic is not None,
             resolution=resolution,
             least={periodic: self._least_order(shapes[0][periodic])} if periodic is not None else {},
-            most=most,
             whole=(periodic,) if periodic is not None and self.axis.kind == "rotary" else (),
             scan=(lambda: self._periodic_scan(effect, shapes, periodic)) if periodic is not None else None,
         )

@@ -35,8 +35,11 @@ class HelperProcesses:
     def __init__(self) -> None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         self._helpers: list[_Helper] = []
-        for _ in range(COUNT if cores > 1 else 0):
-            self._helpers.append(_Helper([helper.connection for helper in self._helpers]))
+        try:
+            for _ in range(COUNT if cores > 1 else 0):
+                self._helpers.append(_Helper([helper.connection for helper in self._helpers]))
+        except OSError:
+            pass  # no room for another process, or none allowed
         self._reads: dict[Path, _Helper] = {}
         self._ready = False
 

@@ -153,7 +153,7 @@ class Term:
         repeatable: several instances with different shapes may be at work at once (harmonics of a cogging).
         resolution: spacing of `shapes` per shaping parameter; local search stays within it.
         least: values of shaping parameters below which they are not searched, by name: a wave of which little more than a
-            period was seen is any slow change; most: above which they are not: a curve wider than all speeds is a level.
+            period was seen is any slow change.
         settled: shaping parameters that are as usual until the search has ended, and then where the model's slopes lead:
             spacing, least and largest value by name.
         blur: by how much shaping parameters are uncertain besides what noise does: standard deviations by name.
@@ -184,7 +184,6 @@ class Term:
     repeatable: bool = False
     resolution: Mapping[str, tuple[str, float]] = dataclasses.field(default_factory=dict)
     least: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    most: Mapping[str, float] = dataclasses.field(default_factory=dict)
     settled: Mapping[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     blur: Mapping[str, float] = dataclasses.field(default_factory=dict)
     scan: Callable[[], FloatArray] | None = None

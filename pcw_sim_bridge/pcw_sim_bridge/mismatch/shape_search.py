@@ -95,8 +95,7 @@ class _Place:
         self._name, self._kind = name, kind
         self._known: dict[float, float] = {}
         self.whole = trials.whole
-        term = trials.regression.problem.terms[instance.term]
-        self._least, self._most = term.least.get(name, -math.inf), term.most.get(name, math.inf)
+        self._least = trials.regression.problem.terms[instance.term].least.get(name, -math.inf)
         # A size that cannot be is no better an explanation for its larger evidence, unless no other is known.
         self._bounded = bounded and trials.tried([instance])[0].allowed
 
@@ -122,7 +121,7 @@ class _Place:
 
     def look_at(self, steps: Sequence[float]) -> None:
         """Find the evidence at several steps at once, which takes hardly longer than at one."""
-        self._known |= {step: -math.inf for step in steps if not self._least <= self.value(step) <= self._most}
+        self._known |= {step: -math.inf for step in steps if self.value(step) < self._least}
         new = [step for step in dict.fromkeys(steps) if step not in self._known]
         found = self._trials.tried([self.moved(step) for step in new]) if new else []
         for step, trial in zip(new, found, strict=True):
