@@ -222,9 +222,9 @@ class AxisProblemBuilder:
             periodic: effects periodic in position that take part, with their shapes.
             with_load: include a friction that follows the load as it is explained so far, which only effects non-linear in
                 the force need.
-            in_channel: fit it in the band of the channel, where it is in proportion to the force that acts. In the wider band
-                the noise of an acceleration may be as large as itself, and what is fitted there is smoother than the force:
-                so it has to be where its magnitude is taken.
+            in_channel: fit it in the band of the channel, where it is in proportion to the force that acts, and give the part
+                of inertia and gravity alone. In the wider band the noise of an acceleration may be as large as itself, and
+                what is fitted there is smoother than the force: so it has to be where its magnitude is taken.
 
         Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
         and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
