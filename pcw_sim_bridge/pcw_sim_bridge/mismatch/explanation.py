@@ -5,9 +5,8 @@
 runs the search, the open-set test and, where something is left that depends on an argument of a named effect, tries the
 refinements of that effect (a friction that differs forwards and backwards). A refined law is adopted if it gains more
 evidence than a name needs, lowers the error on held-out blocks, and leaves nothing that depends on its arguments. Where none
-is, a search is tried in which refinements are parameters like all others; and where that finds none,
-the plain law stays, and a refinement is reported with the leftover: it is the first suspect for physics that
-the library does not hold in full.
+is, a search is tried in which refinements are parameters like all others. If that finds none, too, the plain law stays, and a
+refinement is reported with the leftover: it is the first suspect for physics that the library does not hold in full.
 
 A refinement may stand for what a plain effect stood for before (an asymmetry of friction for an offset). That effect is
 put out only where the recording decides against it, by the odds that separate look-alikes. Where it does not decide, the
