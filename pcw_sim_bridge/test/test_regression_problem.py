@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -233,6 +234,73 @@ def test_what_a_fit_has_itself_counts_against_retuning_and_not_what_it_promises(
     modest = dataclasses.replace(selection.fit, log_evidence=selection.fit.log_evidence - 30.0)
     selection = dataclasses.replace(selection, fit=modest)
     assert search.retuned_away(selection).fit.instances
+
+
+def zeros_problem(turned: Sequence[float], tolerance: float) -> RegressionProblem:
+    """Angles that are off by so much, each a number of the description; an effect that turns all alike, and another one."""
+    time, rng = np.arange(SAMPLES) / RATE, np.random.default_rng(5)
+    rates, names = (1.3, 2.1, 2.9, 3.4), [f"zero/{k}" for k in range(len(turned))]
+
+    def model(angles: Sequence[float]) -> np.ndarray:
+        moved = [np.cos(rate * time + angle) - np.cos(rate * time) for rate, angle in zip(rates, angles, strict=True)]
+        return np.sum(moved, axis=0)[:, None]
+
+    def slope(k: int, angle: float) -> np.ndarray:
+        return -np.sin(rates[k] * time + angle)[:, None]
+
+    def angles(changes, sizes):
+        offset = sum(float(size.coefficients[0]) for size in sizes if size.term == 0)
+        return [changes.get(name, 0.0) - offset for name in names]
+
+    rubs = np.sign(np.sin(0.9 * time))[:, None]
+    measured = model(turned) + rubs + 0.01 * NOISE * rng.standard_normal((SAMPLES, 1))
+    parameter = LinearParameter("offset", "rad", -2.0, 2.0, 0.3, sum_of=tuple((name, -1.0) for name in names))
+    return one_channel(
+        10.0 * np.sin(time), measured[:, 0],
+        nuisances=tuple(Nuisance(name, "rad", 0.0, tolerance, slope(k, 0.0)) for k, name in enumerate(names)),
+        terms=(
+            Term(
+                "offset", ("all",), (parameter,), ({},),
+                lambda shape: -sum(slope(k, 0.0) for k in range(len(names)))[:, :, None], is_exact=True, is_curved=True,
+            ),
+            Term(
+                "friction", ("axis",), (LinearParameter("force", "N", -9.0, 9.0, 3.0),), ({},),
+                lambda shape: rubs[:, :, None],
+            ),
+        ),
+        exact=lambda changes, sizes: (measured - model(angles(changes, sizes)), [*changes]),
+        derive=lambda changes, sizes: {n: slope(k, a) for k, (n, a) in enumerate(zip(names, angles(changes, sizes)))},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("turned", "named"), [((-0.1,) * 4, True), ((-0.1, 0.1, 0.1, -0.1), False), ((-0.03,) * 4, False)]
+)
+def test_what_turns_all_alike_is_found_behind_numbers_that_are_re_tuned(turned, named):
+    """Four zeros, each off by as much, were re-tuned: where the problem is exact at those the effect's column was another."""
+    problem = zeros_problem(turned, 0.025)
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    instances = search.made_exact((Instance(1, (), (0,)),))
+    gains = [candidate.gain for candidate in search.whiten_beside(instances).scan(instances)[0]]
+    assert (max(gains, default=0.0) > 10.0) == named
+    explanation = explain(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    assert {entry.term.effect for entry in explanation.named} == ({"offset", "friction"} if named else {"friction"})
+    assert not explanation.leftovers
+    if named:
+        [estimate] = [entry.estimates["offset"] for entry in explanation.named if entry.term.effect == "offset"]
+        assert estimate.low < -turned[0] < estimate.high
+
+
+def test_an_effect_that_is_numbers_of_the_description_has_their_columns_wherever_they_are_taken():
+    """Its residual is that of the numbers, and so is its column at any place, and no secant from nothing."""
+    problem = zeros_problem((0.4, 0.4, 0.4, 0.4), 0.025)
+    there = problem.exact_at({"zero/0": 0.1}, (SizedTerm(0, (), np.array([-0.3]), (0,)),)).derived()
+    for moved in (problem, there):
+        np.testing.assert_allclose(moved.columns(0, ())[:, :, 0], -moved.nuisance_columns().sum(axis=2))
+    assert np.linalg.norm(there.columns(0, ()) - problem.columns(0, ())) > 0.1 * np.linalg.norm(problem.columns(0, ()))
+    left = there.residual - there.nuisance_columns()[:, :, 0] * 0.1 + there.columns(0, ())[:, :, 0] * 0.3
+    np.testing.assert_allclose(left, problem.exact({"zero/0": 0.4, "zero/1": 0.3, "zero/2": 0.3, "zero/3": 0.3}, ())[0])
+    np.testing.assert_array_equal(there.tangent().columns(0, ()), there.columns(0, ()))
 
 
 @pytest.mark.parametrize(("angle", "named"), [(0.3, False), (0.7, True), (1.2, True)])

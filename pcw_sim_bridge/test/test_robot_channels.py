@@ -119,6 +119,31 @@ def test_zeros_as_numbers_and_as_effects_are_one_thing_also_where_nothing_tracks
     assert sizes[2] < 0.02 * sizes[1]
 
 
+@pytest.mark.parametrize(
+    ("effect", "size"), [("steer_zero_offset", 0.002), ("wheel_radius_error", 5e-5), ("caster_offset_error", 1e-4)]
+)
+def test_the_column_of_what_changes_numbers_alone_is_theirs_and_what_the_model_does(
+    healthy: Recording, effect: str, size: float
+) -> None:
+    """The exact residual of an effect of all casters is that of their numbers, and the numbers' columns lead there."""
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
+    index = next(k for k, t in enumerate(problem.terms) if t.effect == effect and t.target == THESIS.caster_names)
+    term, shape = problem.terms[index], tuple(sorted(problem.terms[index].shapes[0].items()))
+    for k, parameter in enumerate(term.parameters):
+        coefficients = np.zeros(len(term.parameters))
+        coefficients[k] = size
+        changes = {name: factor * size for name, factor in parameter.sum_of}
+        assert sorted(name.split("/")[1] for name in changes) == sorted(THESIS.caster_names)
+        plain, numbers = (problem.exact(some, ())[0] for some in ({}, changes))
+        worked = problem.exact({}, (SizedTerm(index, shape, coefficients, (k,)),))[0]
+        np.testing.assert_allclose(worked, numbers, atol=1e-9 * float(np.abs(numbers).max()))
+        valid, column = problem.valid, problem.columns(index, shape)[:, :, k]
+        assert np.linalg.norm((plain - worked - size * column)[valid]) < 0.02 * np.linalg.norm((plain - worked)[valid])
+        np.testing.assert_allclose(column, sum(f * dict(zip(
+            [n.name for n in problem.nuisances], np.moveaxis(problem.nuisance_columns(), 2, 0), strict=True
+        ))[name] for name, f in parameter.sum_of))
+
+
 def test_wheels_that_spin_all_together_are_told_by_what_else_feels_the_motion(healthy: Recording) -> None:
     """No wheel contradicted the others when all of them turned about at once: half a second was all of the error."""
     builder = RobotProblemBuilder(THESIS, [healthy])

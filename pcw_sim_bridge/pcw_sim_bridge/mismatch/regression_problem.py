@@ -100,6 +100,8 @@ class LinearParameter:
         hidden: it is no number of the effect, only of how much of it there is.
         number: of the description, by the nuisance's name, in whose place the parameter stands where the effect is at work:
             its value is the number as it was re-tuned, and the coefficient besides.
+        sum_of: numbers of the description, by the nuisances' names, that a unit of the parameter changes, and by how much: it
+            is these changes and nothing else, and its column is the sum of theirs wherever they are taken.
     """
 
     name: str
@@ -115,6 +117,7 @@ class LinearParameter:
     squared: bool = False
     hidden: bool = False
     number: str = ""
+    sum_of: tuple[tuple[str, float], ...] = ()
 
     def value(self, coefficient: float) -> float:
         """Return the parameter's value for a coefficient; a vanishing inverse is a very large number."""
@@ -381,8 +384,34 @@ class RegressionProblem:
         """The same, not remembered: of a shape that a search only tries."""
         if (term, shape) in self._remembered:
             return self._remembered[term, shape]
-        found = self.terms[term].columns(dict(shape))
+        found = self._with_sums(term, self.terms[term].columns(dict(shape)))
         return self.near[term].column(found) if term in self.near else found
+
+    def _with_sums(self, term: int, columns: FloatArray) -> FloatArray:
+        """Columns (T, C, P) of a term in which parameters that are numbers of the description have those numbers' columns.
+
+        Differences of two steps, or of two places, would leave a rest between them: beside precise sensors that is an effect.
+        """
+        sums = self._sums[term]
+        if not sums:
+            return columns
+        columns = columns.copy()
+        for k, parts in sums.items():
+            columns[:, :, k] = sum(factor * self.nuisances[number].column for number, factor in parts)
+        return columns
+
+    @functools.cached_property
+    def _sums(self) -> list[dict[int, list[tuple[int, float]]]]:
+        """Of each term the parameters that are numbers of the description, by position, with positions of the numbers."""
+        place = {nuisance.name: j for j, nuisance in enumerate(self.nuisances)}
+        return [
+            {
+                k: [(place[name], factor) for name, factor in parameter.sum_of]
+                for k, parameter in enumerate(term.parameters)
+                if parameter.sum_of and all(name in place for name, _ in parameter.sum_of)
+            }
+            for term in self.terms
+        ]
 
     def around(self, term: int, shape: tuple[tuple[str, float], ...]) -> RegressionProblem:
         """Return the problem with columns of a term that may be compared with its secant at the shape where it is exact.
@@ -393,7 +422,7 @@ class RegressionProblem:
         """
         if self.point is None or (term, shape) not in {(size.term, size.shape) for size in self.point.sizes}:
             return self
-        secant, slope = self.columns(term, shape), self.terms[term].columns(dict(shape))
+        secant, slope = self.columns(term, shape), self._with_sums(term, self.terms[term].columns(dict(shape)))
         if np.array_equal(secant, slope):
             return self
         factor = np.sum(secant * slope, axis=(0, 1)) / np.maximum(np.sum(slope**2, axis=(0, 1)), 1e-300)
@@ -463,15 +492,19 @@ class RegressionProblem:
         columns = self.derive(self.point.changes, self._held(self.point.sizes))
         if columns is None:
             return self
-        residual, nuisances = self.residual, []
-        for nuisance in self.nuisances:
-            column = columns.get(nuisance.name, nuisance.column)
-            residual = residual + (column - nuisance.column) * self.point.changes.get(nuisance.name, 0.0)
-            nuisances.append(dataclasses.replace(nuisance, column=column))
-        point = dataclasses.replace(self.point, derived=True)
-        moved = dataclasses.replace(self, residual=residual, nuisances=tuple(nuisances), point=point)
-        moved._remembered.update(self._remembered)
-        return moved
+        numbers = tuple(dataclasses.replace(n, column=columns.get(n.name, n.column)) for n in self.nuisances)
+        moved = dataclasses.replace(self, nuisances=numbers, point=dataclasses.replace(self.point, derived=True))
+        moved._remembered.update(self._without(*(k for k, parameters in enumerate(self._sums) if parameters)))
+        residual = self.residual
+        for old, new in zip(self.nuisances, numbers, strict=True):
+            residual = residual + (new.column - old.column) * self.point.changes.get(old.name, 0.0)
+        for size in self._held(self.point.sizes):
+            if self._sums[size.term]:
+                before, now = (problem.columns(size.term, size.shape) for problem in (self, moved))
+                residual = residual + (now - before) @ size.coefficients
+        there = dataclasses.replace(moved, residual=residual)
+        there._remembered.update(moved._remembered)
+        return there
 
     def with_headings(self, changes: Mapping[str, float]) -> RegressionProblem:
         """Return the problem in which effects are those of headings and a floor as these changes turn and tilt them.
@@ -551,7 +584,7 @@ class RegressionProblem:
             columns = before.copy()
             parameters = self.terms[size.term].parameters
             for k, (parameter, coefficient) in enumerate(zip(parameters, size.coefficients, strict=True)):
-                if abs(coefficient) < CURVED_FROM * parameter.deviation:
+                if abs(coefficient) < CURVED_FROM * parameter.deviation or k in self._sums[size.term]:
                     continue
                 less, more = (self._left(*at, index, k, part) for part in (1.0 - NEARBY, 1.0 + NEARBY))
                 if less is not None and more is not None:
@@ -616,7 +649,7 @@ class RegressionProblem:
             return columns, powers
         columns = columns.copy()
         for k, (parameter, coefficient) in enumerate(zip(term.parameters, size.coefficients, strict=True)):
-            if abs(coefficient) < CURVED_FROM * parameter.deviation:
+            if abs(coefficient) < CURVED_FROM * parameter.deviation or k in self._sums[size.term]:
                 continue
             without, weaker = (self._left(changes, sizes, index, k, part) for part in (0.0, WEAKER))
             if without is None or weaker is None:

@@ -38,7 +38,7 @@ from .composed_columns import Columns, Placed, Turning, frozen
 from .first_look import Chosen, ChosenShapes, Looked, common_orders, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term, term_key
 from .robot_effects import torque_along
-from .robot_nuisances import FLOOR
+from .robot_nuisances import CHANGED_BY, FLOOR
 
 DIRECTIONS = 8  # of a grid over all directions
 HEIGHTS = 0.5  # of the typical height, the distance of neighbours
@@ -307,7 +307,8 @@ class _TermMaker:
             columns=self._put_together(remembered, chosen, turning),
             arguments=VARIABLES_OF.get(type(effect), ()),
             parameters=tuple(
-                _linear(p, neutral[p.name], room) for p, room in zip(shown, self._room(everything[:, :, seen]), strict=True)
+                dataclasses.replace(_linear(p, neutral[p.name], room), sum_of=_changed(effect, p, target))
+                for p, room in zip(shown, self._room(everything[:, :, seen]), strict=True)
             ),
             # A shift of noisy samples is no column: see `ClockEffect` in robot_effects. A secant would be one.
             is_exact=not isinstance(effect, ClockEffect) or self.exact_clocks,
@@ -485,6 +486,14 @@ def _heights(effect: Effect) -> dict[str, tuple[float, float, float]]:
 def _only(effect: Effect, parameter: EffectParameter) -> dict[str, float]:
     """Parameters of an effect of which one alone is not zero."""
     return {p.name: float(p is parameter) for p in effect.parameters}
+
+
+def _changed(effect: Effect, parameter: EffectParameter, target: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Numbers of the description that a parameter changes and nothing else, by name, and by how much per unit."""
+    if (effect.name, parameter.name) not in CHANGED_BY:
+        return ()
+    number, factor = CHANGED_BY[effect.name, parameter.name]
+    return tuple((f"{number}/{caster}", factor) for caster in target)
 
 
 def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:
