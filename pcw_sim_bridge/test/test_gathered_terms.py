@@ -113,6 +113,34 @@ def test_weak_drives_and_steerings_are_a_payload_unless_the_recording_objects(lo
         assert np.hypot(place["x"] + 0.15, place["y"] + 0.01) < 0.02
 
 
+@pytest.mark.parametrize("loaded", [True, pytest.param(False, marks=pytest.mark.nightly)])
+def test_weak_steerings_are_strong_drives_and_a_payload_where_inertias_say_so(loaded):
+    """A payload hid behind motors that were stronger by as much: named was the one effect that turns all of that round."""
+    robot = load_robot("thesis")
+    effects = [EffectInstance("torque_constant_error", robot.caster_names, {"error": -0.3}, "steer")]
+    if loaded:
+        effects = [
+            EffectInstance("torque_constant_error", robot.caster_names, {"error": 0.45}, "drive"),
+            EffectInstance("payload_mass", ("chassis",), {"mass": 0.5 * robot.total_mass, "x": 0.04, "y": -0.09, "z": 0.3}),
+        ]
+    recording = simulate(World(robot, robot, "reduced"), Run("run", "identification", 12.0, 3), effects)
+    problem = RobotProblemBuilder(robot, [recording]).build()
+    [steer] = [
+        k for k, term in enumerate(problem.terms)
+        if (term.effect, term.axis) == ("torque_constant_error", "steer") and len(term.target) == robot.n
+    ]  # fmt: skip
+    search = EffectSearch(problem, np.random.default_rng(0))
+    threshold = search.settings.smallest_threshold
+    one = search.conclude(search.made_exact((Instance(steer, (), (0,)),)), threshold)
+    found = search.with_other_axis(one)
+    named = [(problem.terms[instance.term].effect, problem.terms[instance.term].axis) for instance in found.fit.instances]
+    if not loaded:
+        assert named == [("torque_constant_error", "steer")]
+        return
+    assert named == [("torque_constant_error", "drive"), ("payload_mass", None)]
+    assert found.fit.mean[-2:] == pytest.approx([0.45, 0.5 * robot.total_mass], rel=0.1)
+
+
 @pytest.mark.parametrize("by_load", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_a_friction_and_a_resistance_at_one_wheel_are_a_resistance_at_all_of_them_unless_the_recording_objects(by_load):
     """From where both are named neither gives way to one more: what tells them apart, the load, was judged beside them."""

@@ -141,6 +141,33 @@ def test_a_secant_is_exact_with_the_effect_and_without_it():
     assert there.residual == pytest.approx(exact({}, [])[0])
 
 
+def test_columns_of_an_effect_are_the_models_own_in_any_shape_where_it_is_exact():
+    """A first order is that of a size near zero, and the secant that of one shape."""
+    time = np.arange(SAMPLES) / RATE
+
+    def work(size: float, phase: float) -> np.ndarray:
+        return (size**2 * np.sin(2.1 * time + phase))[:, None]
+
+    measured = work(2.0, 0.8)
+
+    def exact(changes, sizes):
+        return measured - sum(work(float(s.coefficients[0]), dict(s.shape)["phase"]) for s in sizes), []
+
+    term = Term(
+        "wave", ("axis",), (LinearParameter("size", "1", 0.0, 9.0, 3.0),), ({"phase": 0.5},),
+        lambda shape: 0.1 * work(1.0, shape["phase"])[:, :, None], is_exact=True, is_curved=True,
+    )  # fmt: skip
+    problem = one_channel(measured[:, 0], measured[:, 0], nuisances=(), terms=(term,), exact=exact)
+    own, other = (("phase", 0.5),), (("phase", 0.9),)
+    assert problem.with_secants(0, own) is problem
+    there = problem.exact_at({}, (SizedTerm(0, own, np.array([1.5]), (0,)),))
+    assert there.with_secants(0, other) is there
+    moved = there.with_secants(0, own)
+    for phase, shape in ((0.5, own), (0.9, other)):
+        np.testing.assert_allclose(moved.columns(0, shape)[:, :, 0], work(1.5, phase) / 1.5, atol=1e-12)
+    np.testing.assert_array_equal(there.columns(0, other), problem.columns(0, other))
+
+
 def shaped_problem(seed: int) -> RegressionProblem:
     """A quadratic effect of size 2 that swings with a phase of 0.7, and the model of it."""
     time = np.arange(SAMPLES) / RATE

@@ -8,7 +8,8 @@
    blocks, or that moves no channel by a fair part of what is left of it. Exchange terms where another one does better.
 4. Settle: make the problem exact at what is left, ask whether something that was dropped is missing now, and prune again.
 5. Ask whether fewer effects do as well from the description on, and whether one that looks like an effect does more.
-   What is off at all drives and all steerings gives way to one cause in the chassis, unless the recordings object.
+   What is off at all drives and all steerings gives way to one cause in the chassis, unless the recordings object; what is
+   off at one of the two, to the other and such a cause where that does more.
 6. Ask of every effect whose work re-tuned numbers could do whether they do it as well once the problem is exact at those.
 7. Search the outlines of patches of floor.
 """
@@ -28,7 +29,7 @@ from .effect_gates import EffectGates
 from .exact_problem import DERIVED_AFTER, EXACT_ROUNDS, STEADY, STEADY_EVIDENCE, STEPS
 from .gathered_terms import gatherings
 from .noise_model import SLOW_ORDINATES
-from .outline_search import Outlines, has_outline, reaching, searched_outline
+from .outline_search import Outlines, has_outline, reaching, searched_outline, settled_outline
 from .regression_problem import HEALTHY, FloatArray, RegressionProblem, segment_slices
 from .selection_settings import SelectionSettings
 from .set_growth import GATHERED_AMONG, LadderStep, Progress, SetGrowth
@@ -123,7 +124,7 @@ class EffectSearch(SetGrowth):
         selection = self.settle_on(self.prune(regression, instances, threshold), threshold)
         selection = self.with_best_waves(self.with_hidden_waves(self.gathered(self.afresh(selection))))
         selection = self.against_alike(self.against_fewer(selection))
-        selection = self.with_one_look_alike(self.with_one_cause(selection))
+        selection = self.with_one_look_alike(self.with_other_axis(self.with_one_cause(selection)))
         return self.with_outlines(self.bounded(self.retuned_away(selection)))
 
     def _grown(self, instances: tuple[Instance, ...] = ()) -> tuple[WhitenedRegression, tuple[Instance, ...]]:
@@ -298,6 +299,27 @@ class EffectSearch(SetGrowth):
                 if instead is not selection:
                     self.where_exact[rival, first.term] = min(-odds, REPLACED_ODDS)
                     return instead
+        return selection
+
+    def with_other_axis(self, selection: Selection) -> Selection:
+        """Exchange what is off at all of one axis for the same at the other and a cause in the chassis, where that does more.
+
+        Steerings too weak by a factor are drives too strong by it under masses too large by it. Where strong drives hide a
+        payload one effect does nearly what these two do, and only inertias that no healthy robot has tell that it is not it.
+        """
+        terms = self.problem.terms
+        for instance in selection.fit.instances if self._is_strained(selection.fit) else ():
+            own, alike = terms[instance.term], self._look_alikes(instance)
+            causes = [k for k, t in enumerate(terms) if t.effect in alike and all_effects()[t.effect].target_kind == "chassis"]
+            others = tuple(i for i in selection.fit.instances if i != instance and i.term not in causes)
+            for place, term in enumerate(terms if len(own.target) > 1 and not instance.shape else ()):
+                if (term.effect, term.target) != (own.effect, own.target) or term.axis == own.axis:
+                    continue
+                with_other = (*others, Instance(place, (), term.base_indices()))
+                for cause in causes:
+                    instead, _ = self._with_rival(selection, with_other, cause, max(selection.threshold, STEADY_EVIDENCE))
+                    if instead is not selection:
+                        return instead
         return selection
 
     def _look_alikes(self, instance: Instance) -> tuple[str, ...]:
@@ -527,8 +549,16 @@ class EffectSearch(SetGrowth):
         if instance is None or term not in self.outlines:
             return
         others = tuple(other for other in selection.fit.instances if other != instance)
-        regression = selection.regression.moved(self.problem.around(term, instance.shape))
+        here = self.problem, self._point
+        self._be_exact_at(selection)
+        regression = selection.regression.moved(self.problem.with_secants(term, instance.shape))
         self.outlines[term] = reaching(regression, others, instance, self.outlines[term], DROP)
+        self.problem, self._point = here
+
+    def _be_exact_at(self, selection: Selection) -> None:
+        """Make the problem exact at a selection with just the shapes that it has, which a search of shapes may have moved."""
+        if not self._is_exact_at(selection.fit.instances):
+            self._exact_at(selection.fit)
 
     def _with_better_outline(self, selection: Selection, term: int) -> tuple[Selection, float]:
         """The selection with the best outline of a patch, and what that gains [nats]; 0 where it has it already."""
@@ -536,20 +566,24 @@ class EffectSearch(SetGrowth):
         if instance is None:
             return selection, 0.0
         others = tuple(other for other in selection.fit.instances if other != instance)
-        around = self.problem.around(term, instance.shape)
-        regression = selection.regression.moved(around)
-        found, tried = searched_outline(regression, others, instance, self.outlines.get(term))
+        here = self.problem, self._point
+        self._be_exact_at(selection)
+        exactly, self.problem = self.problem.with_secants(term, instance.shape), self.problem.around(term, instance.shape)
+        regression = selection.regression.moved(self.problem)
+        outlines, tried = searched_outline(regression, others, instance, self.outlines.get(term))
         if tried is not None:
-            self.outlines[term] = tried
-        if found == instance:
-            return selection, 0.0
-        here, self.problem = (self.problem, self._point), around
-        chosen = self.made_exact((*others, found))
-        instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)
-        gain = self.advantage(instead, selection.fit.instances)
-        self.progress(f"{self.label(instance)} as {self.label(found)}: {gain:.1f} nats where exact")
-        if gain >= STEADY_EVIDENCE and any(other.term == term for other in instead.fit.instances):
-            return instead, gain
+            # A first order tells those that are worth it, and the model itself which of them it is.
+            outlines = [instance, *(outline for outline in outlines if outline != instance)]
+            found, self.outlines[term] = settled_outline(
+                selection.regression.moved(exactly), others, outlines, tried
+            )
+            if found != instance:
+                chosen = self.made_exact((*others, found))
+                instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)
+                gain = self.advantage(instead, selection.fit.instances)
+                self.progress(f"{self.label(instance)} as {self.label(found)}: {gain:.1f} nats where exact")
+                if gain >= STEADY_EVIDENCE and any(other.term == term for other in instead.fit.instances):
+                    return instead, gain
         self.problem, self._point = here
         return selection, 0.0
 
@@ -758,7 +792,7 @@ class EffectSearch(SetGrowth):
         instance, others = instances[index], instances[:index] + instances[index + 1 :]
         if not has_outline(instance) or instance.term in self.outlines:
             return instances
-        found, tried = searched_outline(regression, others, instance)
+        (found, *_), tried = searched_outline(regression, others, instance)
         if tried is not None:
             self.outlines[instance.term] = tried
         if found != instance:

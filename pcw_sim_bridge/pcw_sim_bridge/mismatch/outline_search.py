@@ -2,9 +2,10 @@
 
 A few wheels cross a patch here and there. From the place that a first look finds an outline is led to the next one that
 fits there, and a disc never becomes the turned rectangle that fits better: the way from one to the other leads through what
-fits worse. So ellipses and rectangles of several directions and sizes are tried, the best are moved border by border, and
-those that differ most of what is then good are followed downhill in all numbers at once. A disc far too large, about all the
-places where a small patch was crossed, is a hill of its own too: small discs all over it find the other one.
+fits worse. So ellipses and rectangles of several directions and sizes are tried, the best are moved border by border, those
+between ellipse and rectangle a little way downhill in all numbers at once, and then those that differ most of what is good
+to the end. A disc far too large, about all the places where a small patch was crossed, is a hill of its own too: small discs
+all over it find the other one.
 
 What was tried on the way says also how well the outline is known: every one that fits nearly as well may be the true one.
 """
@@ -14,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from scipy import optimize
@@ -27,6 +28,9 @@ OUTLINE = ("x", "y", "length", "width", "yaw", "roundness")
 DIRECTIONS = (0.0, math.pi / 6.0, math.pi / 3.0)
 SIDES = (0.6, 0.85, 1.2)  # of the sides of the outline that was found
 STARTS = 6  # of them are moved
+# Outlines half round, in these directions and with these parts of the sides, are followed for so many evaluations each.
+HALF_ROUND, TURNS, PARTS = 0.5, tuple(k * math.pi / 12.0 for k in range(6)), (0.8, 1.1)
+FIRST_STEPS, WIDE = 100, 0.1
 SMALL = (0.2, 0.3)  # of the mean side: discs all over it and about it
 AROUND = 0.75  # mean sides from the middle to the furthest of them
 SMALL_STARTS = 2  # of each size are moved
@@ -40,7 +44,10 @@ AS_GOOD = 1.0  # nats
 # The best outlines that are so many mean sides apart are followed downhill, from a simplex of this part of a side.
 FINALISTS, APART, SIMPLEX = 4, 0.3, 0.05
 EVALUATIONS, CLOSE_ENOUGH = 500, 0.05  # of a descent: at most, and [nats] to the end
-REACHING, OUTSIDE = 150, 1.0  # evaluations of a walk to the furthest that does as well; sides per nat that it is not worth
+# Mean sides that outlines are apart which are followed on by exact columns, for so many evaluations; so many more are tried.
+NEXT, SETTLING, MOST_AGAIN = 0.15, 150, 100
+# Evaluations of a walk to the furthest that does as well; sides per nat that it is not worth, and of which it is the end.
+REACHING, OUTSIDE, REACHED = 150, 1.0, 1e-3
 WORST = 1e12  # instead of an outline that cannot be
 NARROWEST = 0.05  # [m], about a tyre's contact patch
 NEARLY = 3.0  # nats below the best that an outline of an earlier search may have been
@@ -82,8 +89,10 @@ def has_outline(instance: Instance) -> bool:
 
 def searched_outline(
     regression: WhitenedRegression, others: Sequence[Instance], instance: Instance, before: Outlines | None = None
-) -> tuple[Instance, Outlines | None]:
-    """Return the instance with the outline that explains most beside others, and all that were tried.
+) -> tuple[Sequence[Instance], Outlines | None]:
+    """Return the instance with the outlines that explain most beside others, best first, and all that were tried.
+
+    Where the problem is not exact a first order decides, which may be wrong by more than what is between them.
 
     Where the effect itself would have to be of a size that cannot be, nothing is searched.
 
@@ -93,7 +102,7 @@ def searched_outline(
     trials = _Tried(ShapeTrials(regression, others, instance), instance)
     own = np.array([dict(instance.shape)[name] for name in OUTLINE])
     if not math.isfinite(trials.evidence([own])[0]):
-        return instance, before
+        return [instance], before
     if before is None:
         trials.look_around(own)
     else:  # the fit has changed a little since, and with it which of those that were good is best
@@ -102,6 +111,25 @@ def searched_outline(
         trials.climb(own)
     trials.settle()
     return trials.best(), trials.all_tried()
+
+
+def settled_outline(
+    regression: WhitenedRegression, others: Sequence[Instance], outlines: Sequence[Instance], tried: Outlines
+) -> tuple[Instance, Outlines]:
+    """Return the best outline that several lead to by a problem whose columns hold in any shape, and all that were tried.
+
+    A first order misjudges outlines that are a few centimetres apart by more than what is between them.
+
+    Args:
+        tried: by a search of first order, of which those that were nearly as good as any are asked for again.
+    """
+    trials = _Tried(ShapeTrials(regression, others, outlines[0]), outlines[0])
+    near = tried.outlines[tried.evidence > tried.evidence.max() - NEARLY]
+    trials.evidence([*near[:: math.ceil(len(near) / MOST_AGAIN)]])
+    for outline in outlines:
+        trials.descend(np.array([dict(outline.shape)[name] for name in OUTLINE]), SIMPLEX, SETTLING)
+    trials.round_otherwise()
+    return trials.best()[0], trials.all_tried()
 
 
 def reaching(
@@ -133,6 +161,12 @@ def _starts(own: FloatArray) -> list[FloatArray]:
         if not (roundness == 1.0 and yaw > 0.0 and length == width and own[2] == own[3]):
             found.append(np.array([*own[:2], length * own[2], width * own[3], own[4] + yaw, roundness]))
     return found
+
+
+def _half_round(own: FloatArray) -> list[FloatArray]:
+    """Outlines between ellipse and rectangle about the middle of an outline."""
+    turned = itertools.product(TURNS, PARTS)
+    return [np.array([*own[:2], *(part * own[2:4]), own[4] + turn, HALF_ROUND]) for turn, part in turned]
 
 
 def _small_discs(own: FloatArray) -> list[list[FloatArray]]:
@@ -171,6 +205,8 @@ class _Tried:
         for small in _small_discs(own):
             best = np.argsort([-value for value in self.evidence(small)])[:SMALL_STARTS]
             reached += [self.climb(small[k]) for k in best]
+        for start in _half_round(own):
+            self.descend(start, WIDE, FIRST_STEPS)
         self.spread([*reached, *(starts[k] for k in order)])
 
     def climb(self, outline: FloatArray) -> FloatArray:
@@ -219,47 +255,58 @@ class _Tried:
         A strip of which wheels saw one end may be of any length, if its direction and that end follow: of such ridges there is
         one for every direction tried, and along each a little is lost to the next.
         """
-        finalists: list[FloatArray] = []
+        for outline in self._apart(FINALISTS, APART):
+            self.descend(outline, SIMPLEX, EVALUATIONS)
+
+    def round_otherwise(self) -> None:
+        """Follow the best outline as an ellipse and as a rectangle of its area: with other sides these may do as well."""
+        best = np.array(max(self._known, key=lambda key: self._known[key]))
+        # A rectangle holds so many times what the ellipse within it does, and what is between them about as much between.
+        for roundness in (0.0, 1.0):
+            side = (4.0 / math.pi) ** (0.5 * (roundness - best[5]))
+            self.descend(np.array([*best[:2], *(side * best[2:4]), best[4], roundness]), SIMPLEX, SETTLING)
+
+    def _apart(self, count: int, sides: float, first: Sequence[FloatArray] = ()) -> list[FloatArray]:
+        """The best outlines that are so many mean sides apart, so many with the first ones."""
+        found = list(first)
         for key in sorted(self._known, key=lambda key: -self._known[key]):
             outline = np.array(upright(key))
             side = 0.5 * float(outline[2] + outline[3])
-            if all(np.abs(outline[:4] - other[:4]).sum() > APART * side for other in finalists):
-                finalists.append(outline)
-            if len(finalists) == FINALISTS:
+            if all(np.abs(outline[:4] - other[:4]).sum() > sides * side for other in found):
+                found.append(outline)
+            if len(found) == count:
                 break
-        for outline in finalists:
-            unit = 0.5 * np.array([*[outline[2] + outline[3]] * 4, 2.0, 2.0])
-            simplex = outline / unit + np.vstack([np.zeros(6), SIMPLEX * np.eye(6)])
-            optimize.minimize(
-                lambda parts, unit=unit: -self.evidence([_allowed(parts * unit)])[0], outline / unit, method="Nelder-Mead",
-                options={"initial_simplex": simplex, "maxfev": EVALUATIONS, "xatol": 1e-3, "fatol": CLOSE_ENOUGH,
-                         "adaptive": True},
-            )  # fmt: skip
+        return found
+
+    def descend(self, outline: FloatArray, simplex: float, evaluations: int) -> None:
+        """Follow an outline downhill in all numbers at once, from a simplex of this part of its mean side."""
+        _followed(outline, lambda there: -self.evidence([there])[0], simplex, evaluations, CLOSE_ENOUGH)
 
     def reach(self, k: int, way: float, drop: float) -> None:
         """Follow outlines within a drop of the best [nats] to where one number is smallest or largest; `way`: -1 or 1."""
         best = max(self._known.values())
         within = [np.array(key) for key, value in self._known.items() if value >= best - drop]
         start = max(within, key=lambda outline: way * outline[k])
-        unit = 0.5 * np.array([*[start[2] + start[3]] * 4, 2.0, 2.0])
+        unit = _units(start)[k]
 
-        def cost(parts: FloatArray) -> float:
-            outline = _allowed(parts * unit)
+        def cost(outline: FloatArray) -> float:
             lost = best - self.evidence([outline])[0]
-            return min(float(-way * outline[k] / unit[k]) + OUTSIDE * max(lost - drop, 0.0), WORST)
+            return float(-way * outline[k] / unit) + OUTSIDE * max(lost - drop, 0.0)
 
-        simplex = start / unit + np.vstack([np.zeros(6), SIMPLEX * np.eye(6)])
-        optimize.minimize(
-            cost, start / unit, method="Nelder-Mead",
-            options={"initial_simplex": simplex, "maxfev": REACHING, "xatol": 1e-3, "fatol": 1e-3, "adaptive": True},
-        )  # fmt: skip
+        _followed(start, cost, SIMPLEX, REACHING, REACHED)
 
-    def best(self) -> Instance:
-        """The instance with the smallest of the best outlines: where nobody came there need not be any of it."""
+    def best(self) -> list[Instance]:
+        """The instance with the best outlines that differ.
+
+        First the smallest of the best: where nobody came there need not be any of it.
+        """
         own = tuple(dict(self._instance.shape)[name] for name in OUTLINE)
-        least = max(self._known.values()) - AS_GOOD
-        key = min((key for key, value in self._known.items() if value >= least), key=lambda key: key[2] * key[3])
-        return self._instance if key == own else self._with(upright(key))
+        most = max(self._known.values())
+        alike = [key for key, value in self._known.items() if value >= most - AS_GOOD]
+        smallest = min(alike, key=lambda key: key[2] * key[3])
+        apart = self._apart(FINALISTS, NEXT, [np.array(upright(smallest))])[1:]
+        others = [self._with(outline.tolist()) for outline in apart if self.evidence([outline])[0] > most - FAR]
+        return [self._instance if smallest == own else self._with(upright(smallest)), *others]
 
     def all_tried(self) -> Outlines:
         """All that are not far below the best."""
@@ -290,6 +337,23 @@ def _ways(outline: FloatArray) -> list[FloatArray]:
             (0.0, 0.0, 0.0, 0.0, 2.0, 0.0),
         )
     ]  # fmt: skip
+
+
+def _units(outline: FloatArray) -> FloatArray:
+    """Numbers of an outline that are about as much each: mean sides for lengths, and directions and roundnesses as large."""
+    return 0.5 * np.array([*[outline[2] + outline[3]] * 4, 2.0, 2.0])
+
+
+def _followed(
+    outline: FloatArray, cost: Callable[[FloatArray], float], simplex: float, evaluations: int, close: float
+) -> None:
+    """Ask for a cost along the way downhill from an outline, by a simplex that is so large at first, until it is so close."""
+    unit = _units(outline)
+    optimize.minimize(
+        lambda parts: min(cost(_allowed(parts * unit)), WORST), outline / unit, method="Nelder-Mead",
+        options={"initial_simplex": outline / unit + np.vstack([np.zeros(6), simplex * np.eye(6)]), "maxfev": evaluations,
+                 "xatol": 1e-3, "fatol": close, "adaptive": True},
+    )  # fmt: skip
 
 
 def _allowed(outline: FloatArray) -> FloatArray:

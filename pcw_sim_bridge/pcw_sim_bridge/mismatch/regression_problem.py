@@ -617,6 +617,32 @@ class RegressionProblem:
             left.append(found[0])
         return left[0] - left[1]
 
+    def with_secants(self, term: int, shape: tuple[tuple[str, float], ...]) -> RegressionProblem:
+        """Return the problem in which one effect's columns are the model's own, in whatever shape, at the size that it has.
+
+        Of what is not in proportion to its size a first order says little as soon as its shape is another one. Only of an
+        effect of one parameter, with this shape where the problem is exact; otherwise it is this problem.
+        """
+        sizes = () if self.point is None else self.point.sizes
+        size = next((s for s in sizes if (s.term, s.shape) == (term, shape) and self._holds(s) and s.coefficients[0]), None)
+        if self.exact is None or self.point is None or size is None or len(size.coefficients) > 1:
+            return self
+        changes, others = self.point.changes, self._held([other for other in sizes if other is not size])
+        without, exact, own = self.exact(changes, others), self.exact, self.terms[term]
+        if without is None:
+            return self
+
+        def columns(shape: Shape) -> FloatArray:
+            there = dataclasses.replace(size, shape=tuple(sorted(shape.items())))
+            found = exact(changes, [*others, there])
+            return own.columns(shape) if found is None else ((without[0] - found[0]) / size.coefficients[0])[:, :, None]
+
+        terms = tuple(dataclasses.replace(t, columns=columns) if t is own else t for t in self.terms)
+        near = {other: secant for other, secant in self.near.items() if other != term}
+        moved = dataclasses.replace(self, terms=terms, near=near)
+        moved._remembered.update(self._without(term))
+        return moved
+
     def _holds(self, size: SizedTerm) -> bool:
         """Whether the exact residual holds an effect; laws that came later are not in it."""
         return size.term < len(self.terms) and self.terms[size.term].is_exact
