@@ -64,15 +64,16 @@ def test_the_time_of_a_push_is_found() -> None:
     assert found.among > 10_000, "a choice among so many is paid for"
 
 
-def test_the_place_of_a_patch_is_found() -> None:
+@pytest.mark.parametrize("radius", [0.3, 0.08])
+def test_the_place_of_a_patch_is_found(radius: float) -> None:
     view = looked(np.zeros((1200, 4)))
-    inside = np.linalg.norm(view.places - [0.6, -0.4], axis=2) < 0.3
+    inside = np.linalg.norm(view.places - view.places[400, 1], axis=2) < radius
     view = looked(3.0 * inside)
     columns = np.zeros((1200, 4, 4))
     columns[:, range(4), range(4)] = 1.0
     best = patches(view, columns).shapes[0]
-    assert np.hypot(best["x"] - 0.6, best["y"] + 0.4) < 0.15
-    assert best["length"] == pytest.approx(0.6, rel=0.5)
+    assert np.hypot(best["x"] - view.places[400, 1, 0], best["y"] - view.places[400, 1, 1]) < 0.5 * radius
+    assert best["length"] == pytest.approx(2.0 * radius, rel=0.5)
 
 
 def test_length_and_direction_of_waves_are_found() -> None:

@@ -27,14 +27,16 @@ MOST_ORDERS = 4
 SLOW_PART = 0.1
 # Of a joint that turns by so much [rad], and by no whole turn, ripples are known by so many of their waves.
 LEAST_TURN, LEAST_WAVES = 1.5, 3.0
-# Pushes last so long [s]; patches of floor measure so much [m], on a grid of such cells.
+# Pushes last so long [s]; patches of floor have such radii [m], on a grid of such cells.
 LONGEST_PUSH, SHORTEST_PUSH = 12.0, 0.4
-PATCHES = (0.12, 0.18, 0.27, 0.4, 0.6, 0.9)
+PATCHES = (0.08, 0.12, 0.18, 0.27, 0.4, 0.6, 0.9)
 CELL, MOST_CELLS = 0.05, 400
 # A patch that most of the way lies on is a floor.
 LARGEST_PATCH_PART = 0.4
 WAVES, WAVE_DIRECTIONS = (0.15, 5.0), 24
 MOST_SHAPES = 3
+# Patches are chosen as if nothing else were re-tuned for them: which of so many it is, beside that, a fit to all says.
+MOST_PATCHES = 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,7 +223,7 @@ def patches(looked: Looked, columns: FloatArray) -> ChosenShapes:
             x, y = low + (np.array([row, column]) + 0.5) * cell
             found.append((float(gain[row, column]), float(x), float(y), radius))
             gain[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 0.0
-    kept = sorted(found, reverse=True)[: 2 * MOST_SHAPES]
+    kept = sorted(found, reverse=True)[:MOST_PATCHES]
     shapes = tuple({"x": x, "y": y, "length": 2.0 * r, "width": 2.0 * r} for _, x, y, r in kept)
     resolution = {"x": ("linear", 0.1), "y": ("linear", 0.1), "length": ("log", 1.6), "width": ("log", 1.6)}
     return ChosenShapes(shapes, int(np.count_nonzero(maps[1])) * len(PATCHES), resolution)
