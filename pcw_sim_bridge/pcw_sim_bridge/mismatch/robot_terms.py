@@ -489,8 +489,12 @@ def _only(effect: Effect, parameter: EffectParameter) -> dict[str, float]:
 
 
 def _changed(effect: Effect, parameter: EffectParameter, target: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Numbers of the description that a parameter changes and nothing else, by name, and by how much per unit."""
-    if (effect.name, parameter.name) not in CHANGED_BY:
+    """Numbers of the description of several casters that a parameter changes and nothing else, by name, and how much per unit.
+
+    Of one caster an effect keeps its own columns, which are secants where it is far off: by the numbers' slopes one of two
+    wheels that were 0.2 m off was re-tuned.
+    """
+    if len(target) == 1 or (effect.name, parameter.name) not in CHANGED_BY:
         return ()
     number, factor = CHANGED_BY[effect.name, parameter.name]
     return tuple((f"{number}/{caster}", factor) for caster in target)
