@@ -73,7 +73,7 @@ def test_the_place_of_a_patch_is_found(radius: float) -> None:
     columns[:, range(4), range(4)] = 1.0
     best = patches(view, columns).shapes[0]
     assert np.hypot(best["x"] - view.places[400, 1, 0], best["y"] - view.places[400, 1, 1]) < 0.5 * radius
-    assert best["length"] == pytest.approx(2.0 * radius, rel=0.5)
+    assert best["length"] == pytest.approx(2.0 * radius, rel=0.4)
 
 
 def test_length_and_direction_of_waves_are_found() -> None:

@@ -574,9 +574,7 @@ class EffectSearch(SetGrowth):
         if tried is not None:
             # A first order tells those that are worth it, and the model itself which of them it is.
             outlines = [instance, *(outline for outline in outlines if outline != instance)]
-            found, self.outlines[term] = settled_outline(
-                selection.regression.moved(exactly), others, outlines, tried
-            )
+            found, self.outlines[term] = settled_outline(selection.regression.moved(exactly), others, outlines, tried)
             if found != instance:
                 chosen = self.made_exact((*others, found))
                 instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)

@@ -5,7 +5,8 @@ fits there, and a disc never becomes the turned rectangle that fits better: the 
 fits worse. So ellipses and rectangles of several directions and sizes are tried, the best are moved border by border, those
 between ellipse and rectangle a little way downhill in all numbers at once, and then those that differ most of what is good
 to the end. A disc far too large, about all the places where a small patch was crossed, is a hill of its own too: small discs
-all over it find the other one.
+all over it find the other one. All that is by the first order of what a patch does, which is wrong by more than there is
+between outlines a few centimetres apart: the best are followed on by what the model itself makes of them.
 
 What was tried on the way says also how well the outline is known: every one that fits nearly as well may be the true one.
 """
