@@ -10,6 +10,7 @@ from pcw_sim_bridge.mismatch.effect_gates import (
     NOISY_FACTOR,
     NOISY_PART,
     EffectGates,
+    _Left,
 )
 from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
@@ -78,9 +79,9 @@ def _share_with(nats: float, term: dict[str, object]) -> float:
     plain = {"effect": "friction", "target": ("a",), "axis": None, "noisy": False, "at_joints": False, "unlike_errors": False}
     problem = SimpleNamespace(
         terms=[SimpleNamespace(**plain | term), SimpleNamespace(**plain | {"target": CASTERS})], scale_deviation=0.0,
-        measured=np.ones((2, 1)), valid=np.ones((2, 1), dtype=bool), misjudged=np.ones((2, 1)), drifts=np.ones((2, 1, 1)),
+        measured=np.ones((2, 1)), valid=np.ones((2, 1), dtype=bool), drifts=np.ones((2, 1, 1)),
     )
     regression = SimpleNamespace(peculiar=lambda change: nats)
-    size, remains, none = np.array([0.5]), np.array([0.1]), np.array([0.0])
+    size, left = np.array([0.5]), _Left(np.array([0.1]), np.ones((2, 1)))
     gates = EffectGates(problem, SelectionSettings())  # type: ignore[arg-type]
-    return gates._share(regression, [SimpleNamespace(term=0)], size[:, None], size, (remains, none))
+    return gates._share(regression, [SimpleNamespace(term=0)], size[:, None], size, left, np.array([0.0]))

@@ -307,7 +307,7 @@ def test_what_is_retuned_beside_effects_of_other_channels_is_proved(deviating: P
     assert not explanation.named
     prover = Prover(
         nominal, opened, [], lambda e: {n.name: 0.0 for n in e.search.problem.nuisances}, lambda e, _: e,
-        np.random.default_rng(0),
+        lambda e, own, rival: e, np.random.default_rng(0),
     )  # fmt: skip
     finding = prover.prove(explanation, besides).finding
     assert finding.rollout_gap_closed is not None
@@ -660,7 +660,7 @@ def test_a_small_law_that_other_data_contradict_is_no_finding(
     prover = SimpleNamespace(
         _held_out=lambda explanation: against, _rollout=lambda explanation, held_out: None,
         _impossible=lambda explanation, held_out: None, _useless=lambda explanation, held_out: says(prover, "errors"),
-        _misleading=lambda explanation, held_out, after: says(prover, "simulation"),
+        _instead=lambda *rest: None, _misleading=lambda explanation, held_out, after: says(prover, "simulation"),
         _no_better=lambda explanation, held_out: None, _is_patched=lambda explanation: False,
         _not_helping=lambda explanation, held_out, after: frozenset(),
         _remarks=lambda *rest: [], _finding=lambda *rest: None, untuned=frozenset(),
@@ -866,3 +866,47 @@ def test_held_out_data_that_hardly_hold_an_effect_do_not_refuse_it(
     )
     found = Prover._useless(SimpleNamespace(), SimpleNamespace(named=(named,)), held_out)  # type: ignore[arg-type]
     assert (found is not None) is refused
+
+
+@pytest.mark.parametrize(
+    ("helps", "leaves", "refused", "others", "taken"),
+    [
+        (25.0, 0, False, True, True),
+        (8.0, 0, False, True, False),  # the fitted data may say as much against it
+        (25.0, 1, False, True, False),  # nor is it what is there where more is left with it
+        (25.0, 0, True, True, False),
+        (25.0, 0, False, False, False),  # manoeuvres that were fitted, too, tell nothing new of it
+    ],
+)
+def test_a_look_alike_that_other_recordings_bear_out_stands_in_for_one_that_they_contradict(
+    monkeypatch: pytest.MonkeyPatch, helps: float, leaves: int, refused: bool, others: bool, taken: bool
+) -> None:
+    """A Coulomb friction was a viscous one where the steering never turned fast, and then nothing at all."""
+    monkeypatch.setattr(proof, "LawModels", lambda explanation, refused: SimpleNamespace(laws={}))
+    viscous, coulomb = Instance(0, (), (0,)), Instance(1, (), (0,))
+    search = SimpleNamespace(
+        place="of the viscous one", contradicted=set(), stand_ins=lambda selection, own: [coulomb],
+        label=lambda instance: ("viscous", "coulomb")[instance.term],
+    )
+    explanation = SimpleNamespace(search=search, selection=None, leftovers=())
+    instead = SimpleNamespace(search=search, leftovers=(None,) * leaves)
+
+    def exchange(before: object, own: Instance, rival: Instance) -> SimpleNamespace:
+        assert (before, own, rival) == (explanation, viscous, coulomb)
+        search.place = "of the other one"
+        return instead
+
+    prover = SimpleNamespace(
+        other=object() if others else None, laws=SimpleNamespace(laws={}), exchange=exchange,
+        _held_out=lambda judged: SimpleNamespace(proposed=(0,), instances=(coulomb,), help_of=lambda index: (helps, 40.0)),
+        _useless=lambda judged, held_out: (0, "worse") if refused else None,
+    )
+    held_out = SimpleNamespace(instances=(viscous,), help_of=lambda index: (-1800.0, 900.0))
+    found = Prover._instead(prover, explanation, held_out, 0, ())  # type: ignore[arg-type]
+    assert search.place == ("of the other one" if taken else "of the viscous one")
+    if not taken:
+        assert found is None
+        return
+    assert found is not None and search.contradicted == {0}
+    assert found[0] is instead and found[1].description == "exchange viscous for coulomb" and found[1].gain == 25.0
+    assert found[2] == "viscous does as well as coulomb where it was fitted. Held out coulomb helps, and it does not."

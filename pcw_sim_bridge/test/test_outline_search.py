@@ -11,7 +11,14 @@ import pytest
 from pcw_sim_bridge.mismatch.effect_gates import EffectGates
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.explanation import named_terms
-from pcw_sim_bridge.mismatch.outline_search import OUTLINE, Outlines, has_outline, reaching, searched_outline
+from pcw_sim_bridge.mismatch.outline_search import (
+    OTHERS,
+    OUTLINE,
+    Outlines,
+    has_outline,
+    reaching,
+    searched_outline,
+)
 from pcw_sim_bridge.mismatch.regression_problem import Channel, LinearParameter, RegressionProblem, Term
 from pcw_sim_bridge.mismatch.shape_search import DROP
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
@@ -245,6 +252,19 @@ def test_what_was_tried_is_told_upright():
     assert shape["yaw"] == pytest.approx(2.0 - 0.5 * math.pi, abs=0.1)
     assert np.all(tried.outlines[:, 2] >= tried.outlines[:, 3])
     assert np.all(np.abs(tried.outlines[:, 4]) <= 0.5 * math.pi)
+
+
+def test_outlines_that_other_recordings_are_asked_about_differ_from_the_fitted_one_and_from_each_other():
+    """Best first, none far below the best, and none of those about the one that was fitted."""
+    middles = np.array([[0.0, 0.0], [0.01, 0.0], [0.3, 0.0], [0.31, 0.0], [0.6, 0.0], [0.9, 0.0]])
+    outlines = np.column_stack([middles, np.full((6, 2), 0.5), np.zeros(6), np.ones(6)])
+    tried = Outlines(outlines, np.array([-1.0, -2.0, -3.0, -2.5, -9.0, -30.0]), np.ones((6, 1)))
+    found = tried.apart(dict(zip(OUTLINE, outlines[0], strict=True)), 10.0)
+    assert [shape["x"] for shape in found] == [0.31, 0.6]
+    assert set(found[0]) == set(OUTLINE)
+    row = np.repeat(outlines[:1], 40, axis=0) + np.arange(40)[:, None] * np.eye(6)[0]
+    many = Outlines(row, -np.ones(40), np.ones((40, 1)))
+    assert len(many.apart(dict(zip(OUTLINE, outlines[0], strict=True)), 10.0)) == OTHERS
 
 
 def test_only_patches_have_an_outline():

@@ -27,7 +27,7 @@ from pcw_sim_bridge.mismatch.regression_problem import (
 from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
 from pcw_sim_bridge.mismatch.shape_search import refined_shape, shape_interval
 from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
-from pcw_sim_bridge.mismatch.whitened_regression import Instance, WhitenedRegression
+from pcw_sim_bridge.mismatch.whitened_regression import Instance, WhitenedRegression, _solve
 
 SAMPLES, RATE = 600, 50.0
 NOISE = 0.01
@@ -298,6 +298,44 @@ def zeros_problem(turned: Sequence[float], tolerance: float) -> RegressionProble
         exact=lambda changes, sizes: (measured - model(angles(changes, sizes)), [*changes]),
         derive=lambda changes, sizes: {n: slope(k, a) for k, (n, a) in enumerate(zip(names, angles(changes, sizes)))},
     )  # fmt: skip
+
+
+def test_steps_that_swing_about_a_number_are_shortened():
+    """A root of what is left, steepest where it is zero: a first order leads as far past it as it was away, and back again."""
+    time, rng = np.arange(SAMPLES) / RATE, np.random.default_rng(3)
+    shape, noise = np.sin(1.3 * time)[:, None], 0.01 * NOISE * rng.standard_normal((SAMPLES, 1))
+
+    def left(number: float) -> np.ndarray:
+        return noise - np.sign(number - 0.3) * math.sqrt(abs(number - 0.3)) * shape
+
+    def slope(number: float) -> np.ndarray:
+        return 0.5 / math.sqrt(max(abs(number - 0.3), 1e-9)) * shape
+
+    problem = one_channel(
+        10.0 * np.sin(time), left(0.0)[:, 0], nuisances=(Nuisance("number", "m", 0.0, 10.0, slope(0.0)),), terms=(),
+        exact=lambda changes, sizes: (left(changes.get("number", 0.0)), [*changes]),
+        derive=lambda changes, sizes: {"number": slope(changes.get("number", 0.0))},
+    )  # fmt: skip
+    squares = []
+    for rounds in (1, 12):
+        search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+        regression = search.whiten_at(noise)
+        _, arrived = search._arrived(regression, regression.fit(()), rounds)
+        squares.append(float(arrived @ arrived))
+    assert squares[1] < 0.1 * squares[0]
+
+
+def test_a_place_where_rounding_swallows_the_prior_has_no_evidence_and_ends_no_search():
+    """A zero 0.2 rad off was followed to where columns are 1e13 times as large as noise: no analysis came of that."""
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((50, 8)) @ rng.standard_normal((8, 12))
+    evidence = []
+    for size in (1.0, 1e13):
+        values = np.column_stack([size * columns, size * rng.standard_normal(50)])
+        mean, covariance, log_determinant, rss = _solve(values.T @ values, np.ones(12))
+        assert np.isfinite(mean).all() and np.isfinite(covariance).all()
+        evidence.append(-0.5 * (log_determinant + rss))
+    assert evidence[1] < evidence[0] - 1e6
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from .explanation import (
     cannot_contradict,
     explain,
     explanation_by,
+    explanation_instead,
     strained_of_the_balance,
 )
 from .findings import (
@@ -156,7 +157,8 @@ def analyse(
 
     def needs_no_explanation() -> tuple[CommandFindings, Sequence[RegressionProblem], Prover, tuple[str, ...]]:
         fitted, others = subject.command_problems(opened), subject.command_problems(held_out, searched=False)
-        prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        prover = Prover(subject, opened, held_out, _reported_numbers, explanation_by, explanation_instead, rng)
         return command_findings(fitted, others, seed, settings, progress), fitted, prover, subject.responses(opened)
 
     explanation, (commands, commanded, prover, responses) = side_by_side(

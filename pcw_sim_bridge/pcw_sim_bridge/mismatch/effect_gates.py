@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
-from .noise_model import channel_deviations
+from .noise_model import channel_deviations, seen_misjudged
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .selection_settings import SelectionSettings
 from .whitened_regression import Fit, Instance, WhitenedRegression, predicted
@@ -21,6 +22,17 @@ NOISY_FACTOR, COMMON_FACTOR = 3.0, 2.0
 LOOSE_PART = 0.2
 # Such an effect must do this part of what remains in some channel, and all of it where it is on all casters, as noise is.
 NOISY_PART = 0.75
+# What is named has to do more to slips than this part of what the model may misjudge of them, however well it foretells them:
+# by a tenth of them loads differ from one lap to the next.
+LEAST_DOUBT = 1.0 / 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Left:
+    """What a fit leaves: of these sizes (C,); `misjudged` by the model (T, C), None: nothing is."""
+
+    sizes: FloatArray
+    misjudged: FloatArray | None
 
 
 class EffectGates:
@@ -37,11 +49,12 @@ class EffectGates:
         if not instances:
             return [], [], []
         residual = regression.unwhitened_residual(fit)
-        remains = channel_deviations(residual, self.problem.valid)
+        left = self._left(residual)
+        remains = left.sizes
         # Outliers in full: weights that hold them down would hold down the very bursts that an event is measured against.
         trust = np.array([channel.information for channel in self.problem.channels])
-        if self.problem.misjudged is not None:
-            trust = trust / (1.0 + (self.problem.misjudged / remains) ** 2)
+        if left.misjudged is not None:
+            trust = trust / (1.0 + (left.misjudged / remains) ** 2)
         white = regression.noise.whiten(residual, self.problem.valid, self.problem.segment)
         unexplained = np.sum(trust * white**2, axis=1)
         full_scores = regression.block_scores(instances)
@@ -72,17 +85,20 @@ class EffectGates:
         total = np.sqrt(np.sum(np.square(own), axis=0))
         shares = []
         for index, (instance, sizes) in enumerate(zip(instances, net, strict=True)):
-            floors = remains, self.settings.smallest_part * total
-            share = self._share(regression, [instance], changes[index], sizes, floors)
+            share = self._share(regression, [instance], changes[index], sizes, left, self.settings.smallest_part * total)
             # A term may do nothing for the prediction and yet be needed: without it the description would be far off.
             needed = retunings[index] / (self.settings.smallest_threshold * self._noise_factor([instance]))
             if self.problem.terms[instance.term].noisy:  # by numbers that the same noise pulls at
                 beside = sizes / np.maximum(self._least(instance) * remains, 1e-300)
-                alone = own[index] / np.maximum(np.maximum(NOISY_FACTOR * remains, self._details([instance])), 1e-300)
+                alone = own[index] / np.maximum(np.maximum(NOISY_FACTOR * remains, self._details([instance], left)), 1e-300)
                 needed = min(needed, float(np.max(np.maximum(beside, alone))))
             share = max(share, needed)
             shares.append(min(share, losses[index] / max(ABOVE_BURSTS * bursts[index], 1e-300)))
         return losses, held_out, shares
+
+    def _left(self, residual: FloatArray) -> _Left:
+        sizes = channel_deviations(residual, self.problem.valid)
+        return _Left(sizes, seen_misjudged(self.problem, residual, LEAST_DOUBT))
 
     def _largest_burst(self, unexplained: FloatArray, at_work: BoolArray) -> float:
         """Most that is left unexplained (T,), beyond what noise leaves, anywhere in a time as long as one at work (T,)."""
@@ -100,10 +116,10 @@ class EffectGates:
 
     def refinement_counts(self, regression: WhitenedRegression, fit: Fit, position: int, refined: Fit) -> bool:
         """Whether what an instance, at a position among those of a fit, does otherwise where it is refined is worth a name."""
-        remains = channel_deviations(regression.unwhitened_residual(refined), self.problem.valid)
+        left = self._left(regression.unwhitened_residual(refined))
         change = predicted(self.problem, refined) - predicted(self.problem, fit)
-        floors = remains, self.settings.smallest_part * self._sizes(self._contribution(refined, position))
-        return self._share(regression, [fit.instances[position]], change, self._sizes(change), floors) >= 1.0
+        part = self.settings.smallest_part * self._sizes(self._contribution(refined, position))
+        return self._share(regression, [fit.instances[position]], change, self._sizes(change), left, part) >= 1.0
 
     def _contribution(self, fit: Fit, position: int) -> FloatArray:
         """What one instance of a fit adds to the residual (T, C)."""
@@ -124,14 +140,13 @@ class EffectGates:
         while len(order) < len(instances) - 1:
             rest = [instance for instance in instances if instance not in order]
             order.append(max(rest, key=lambda instance: regression.fit([*order, instance]).log_evidence))
-        residual = regression.unwhitened_residual(fit)
-        remains = channel_deviations(residual, self.problem.valid)
+        left = self._left(regression.unwhitened_residual(fit))
         explained, cost = predicted(self.problem, fit), regression.tolerance_cost(fit)
         for count in range(len(instances) - 1):
             left_out = [instance for instance in instances if instance not in order[:count]]
             without = regression.fit(order[:count])
             change = explained - predicted(self.problem, without)
-            share = self._share(regression, left_out, change, self._sizes(change), (remains, np.zeros_like(remains)))
+            share = self._share(regression, left_out, change, self._sizes(change), left, np.zeros_like(left.sizes))
             retuning = regression.tolerance_cost(without) - cost
             if max(share, retuning / (len(left_out) * self.settings.smallest_threshold)) < 1.0:
                 return tuple(instance for instance in instances if instance in order[:count])
@@ -143,18 +158,18 @@ class EffectGates:
         instances: Sequence[Instance],
         change: FloatArray,
         sizes: FloatArray,
-        floors: tuple[FloatArray, FloatArray],
+        left: _Left,
+        part: FloatArray,
     ) -> float:
         """Contribution of some instances, a change (T, C) of sizes (C,), against the smallest that counts.
 
-        That is what the model itself misjudges, unless the change does not look like it; and in any case a part of what
-        remains, the first of the floors (C,), and the second one.
+        That is what the model itself misjudges, unless the change does not look like it; and in any case a part of what is
+        left, and `part` (C,).
         """
-        remains, part = floors
         least = max(self._least(instance) for instance in instances)
-        floor = np.maximum(np.maximum(least * remains, part), self._details(instances))
+        floor = np.maximum(np.maximum(least * left.sizes, part), self._details(instances, left))
         share = float(np.max(sizes / np.maximum(floor, 1e-300)))
-        seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * remains, part), 1e-300)))
+        seen = float(np.max(sizes / np.maximum(np.maximum(self.settings.smallest_share * left.sizes, part), 1e-300)))
         if share >= 1.0 or seen < 1.0 or self.problem.drifts is None:
             return share
         return max(share, min(seen, regression.peculiar(change) / self._peculiarity(instances)))
@@ -184,15 +199,15 @@ class EffectGates:
             return self.settings.smallest_share
         return NOISY_PART if len(term.target) < self._most_targets() else 1.0
 
-    def _details(self, instances: Sequence[Instance]) -> FloatArray:
+    def _details(self, instances: Sequence[Instance], left: _Left) -> FloatArray:
         """What the model itself misjudges (C,), which is no effect: two deviations of its scale, and its slips.
 
         What the wind-up of gears does to slips is like what a torque does to them: it must stand out from that several times.
         """
         scale = 2.0 * self.problem.scale_deviation * self._sizes(self.problem.measured)
-        if self.problem.misjudged is None:
+        if left.misjudged is None:
             return scale
-        return np.maximum(scale, self._noise_factor(instances) * self._sizes(self.problem.misjudged))
+        return np.maximum(scale, self._noise_factor(instances) * self._sizes(left.misjudged))
 
     def _noise_factor(self, instances: Sequence[Instance]) -> float:
         """By how much more some instances must stand out because their columns hold noise that the residual holds."""

@@ -92,6 +92,8 @@ class EffectSearch(SetGrowth):
         self.where_exact: dict[tuple[int, int], float] = {}
         # Outlines of patches of floor that were tried, by term.
         self.outlines: dict[int, Outlines] = {}
+        # Terms that held-out recordings contradict, whatever the fitted ones say.
+        self.contradicted: set[int] = set()
         # Tolerances of numbers that effects took over, by (term, parameter), as deviations of the coefficient.
         self.taken_over: dict[tuple[int, int], float] = {}
         # Place and spread of the Gumbel distribution of the largest gain that noise alone reaches.
@@ -401,6 +403,12 @@ class EffectSearch(SetGrowth):
                     instead = self.settle_on(self.conclude((*others, rival), selection.threshold), selection.threshold)
                     if any(found.term == rival.term for found in instead.fit.instances):
                         return instead
+                    # Beside the other one numbers may have moved to where the effect itself does more than either did before.
+                    if _terms(instead.fit.instances) == _terms(instances):
+                        better = self._reached_with(selection.regression, instead.fit.instances)[0] - own[0]
+                        if better > STEADY_EVIDENCE:
+                            self.progress(f"the same where that led: {better:.1f} nats more")
+                            return self.against_alike(instead)
             self.problem, self._point = here  # the selection is exact there
         return selection
 
@@ -426,14 +434,29 @@ class EffectSearch(SetGrowth):
                 found.append(refined_shape(regression, others, candidates[0].instance))
         return (problem, None), found
 
-    def _alike(self, selection: Selection, others: tuple[Instance, ...], own: Instance) -> list[Instance]:
-        """Effects that do an effect's work nearly as well, to the first order of one of the two."""
+    def stand_ins(self, selection: Selection, own: Instance) -> list[Instance]:
+        """Effects that the library says look like one, and other outlines of a patch of floor, that do its work as well."""
+        others = tuple(instance for instance in selection.fit.instances if instance != own)
+        effect, effects = self.problem.terms[own.term].effect, [term.effect for term in self.problem.terms]
+        found = [
+            rival for rival in self._alike(selection, others, own, straight=True)
+            if effects[rival.term] in self._look_alikes(own) or effect in self._look_alikes(rival)
+        ]
+        if own.term in self.outlines:
+            outlines = self.outlines[own.term].apart(dict(own.shape), ALIKE)
+            found += [selection.regression.with_shape(own, dict(own.shape) | shape) for shape in outlines]
+        return found
+
+    def _alike(
+        self, selection: Selection, others: tuple[Instance, ...], own: Instance, straight: bool = False
+    ) -> list[Instance]:
+        """Effects that do an effect's work nearly as well, to the first order of one of the two; straight: or of none."""
         regression, terms = selection.regression, self.problem.terms
         found = []
         for candidate in regression.scan(others)[0]:
-            if not math.isfinite(candidate.gain) or candidate.instance.term == own.term:
+            if not math.isfinite(candidate.gain) or candidate.instance.term in {own.term, *self.contradicted}:
                 continue
-            if not terms[candidate.instance.term].is_curved and not terms[own.term].is_curved:
+            if not straight and not terms[candidate.instance.term].is_curved and not terms[own.term].is_curved:
                 continue
             if self.repeats(candidate.instance, others):
                 continue

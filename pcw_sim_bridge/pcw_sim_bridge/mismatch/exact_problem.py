@@ -26,6 +26,7 @@ GROWTH = 1.01  # by which the error of a step may be more, numbers of a first or
 DERIVED_AFTER = 2
 # A fit that moves less than this part of its intervals' deviations has arrived.
 STEADY = 0.2
+SHORTER = 0.25  # part of a step that led to less than there was
 STEADY_EVIDENCE = 1.0  # nats; what a set is worth where it is exact is not asked for more exactly
 
 
@@ -46,6 +47,15 @@ class ExactProblem:
         # Of the problem and set that were last asked for: one step of a search ends where the next one begins.
         self._last_left: tuple[RegressionProblem, tuple[Instance, ...], FloatArray, float] | None = None
         self._last_beside: tuple[FloatArray, WhitenedRegression] | None = None
+
+    @property
+    def place(self) -> tuple[RegressionProblem, dict[object, float] | None]:
+        """The problem as it is exact now, to come back to."""
+        return self.problem, self._point
+
+    @place.setter
+    def place(self, place: tuple[RegressionProblem, dict[object, float] | None]) -> None:
+        self.problem, self._point = place
 
     def whiten_at(self, residual: FloatArray, white: bool = False, by_channel: bool = False) -> WhitenedRegression:
         """Whiten the problem by the noise of a residual (T, C); the regression's blocks are those of time, or channels."""
@@ -206,21 +216,27 @@ class ExactProblem:
         return evidence, left
 
     def _arrived(self, regression: WhitenedRegression, fit: Fit, rounds: int) -> tuple[float, FloatArray]:
-        """Log evidence and whitened residual of a set at the best of so many steps; the problem stays exact there."""
-        reached, left, place = -math.inf, regression.whitened_residual(fit), (self.problem, self._point)
+        """Log evidence and whitened residual of a set at the best of so many steps; the problem stays exact there.
+
+        Where a step leads past what it promised a shorter one is tried from where it began: tyres near the peak of their
+        friction make it swing to and fro between places that are worth hundreds of nats less than what is between them.
+        """
+        reached, left, place, part = -math.inf, regression.whitened_residual(fit), (self.problem, self._point), 1.0
         for _ in range(rounds):
-            if not self._exact_at(fit):
+            if not self._exact_at(fit, part):
                 break
             self.problem = self.problem.derived()
-            regression = regression.moved(self.problem)
-            fit = regression.fit(fit.instances)
-            point = self._point_of(fit)
-            missing = point - fit.mean
-            promised = fit.log_evidence
-            there = promised - 0.5 * float(missing @ np.linalg.solve(fit.covariance, missing))
-            if there > reached:
-                reached, left = there, regression.whitened_residual(dataclasses.replace(fit, mean=point))
-                place = self.problem, self._point
+            moved = regression.moved(self.problem)
+            trial = moved.fit(fit.instances)
+            point = self._point_of(trial)
+            missing = point - trial.mean
+            promised = trial.log_evidence
+            there = promised - 0.5 * float(missing @ np.linalg.solve(trial.covariance, missing))
+            if there <= reached:
+                (self.problem, self._point), part = place, SHORTER * part
+                continue
+            reached, left = there, moved.whitened_residual(dataclasses.replace(trial, mean=point))
+            place, regression, fit, part = (self.problem, self._point), moved, trial, min(part / math.sqrt(SHORTER), 1.0)
             if promised - there < STEADY_EVIDENCE:
                 break
         self.problem, self._point = place

@@ -393,6 +393,12 @@ def explanation_by(explanation: Explanation, instances: Sequence[Instance], know
     )
 
 
+def explanation_instead(explanation: Explanation, own: Instance, rival: Instance) -> Explanation:
+    """Return the explanation with another effect in one's place, made exact there; what it was is to be come back to."""
+    others = tuple(instance for instance in explanation.fit.instances if instance != own)
+    return explanation_by(explanation, explanation.search.made_exact((*others, rival)))
+
+
 def _doubted(entry: NamedTerm, doubts: Mapping[Instance, tuple[float, str]]) -> NamedTerm:
     """The entry, said to be ambiguous with another effect if the recording does not decide between them."""
     if entry.instance not in doubts:
@@ -763,7 +769,9 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
     # One that has been named since, beside this effect, is no rival any more.
     beside = {other.term for other in others}
     where_exact = {
-        rival: odds for (named, rival), odds in search.where_exact.items() if named == own.term and rival not in beside
+        rival: odds
+        for (named, rival), odds in search.where_exact.items()
+        if named == own.term and rival not in beside | search.contradicted
     }
     for position, refined in _refinements(problem, others):
         trial = regression.fit(refined)
@@ -780,13 +788,14 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
             if rivals[-1] > -AMBIGUOUS:
                 alike.append(problem.terms[form.term].effect)
     for rival, usual in search.usual_rivals(regression, others, own):
+        if rival.term in search.contradicted:
+            continue
         rivals.append(regression.log_odds(usual, fit))
         if rivals[-1] > -AMBIGUOUS:
             alike.append(_called(problem.terms[own.term], problem.terms[rival.term]))
     for candidate in regression.scan(others)[0]:
-        same = candidate.instance.term == own.term
         if (
-            same
+            candidate.instance.term in {own.term, *search.contradicted}
             or not math.isfinite(candidate.gain)
             or without.log_evidence + candidate.gain < fit.log_evidence - 30.0
         ):

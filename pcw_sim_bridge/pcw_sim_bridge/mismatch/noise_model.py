@@ -32,6 +32,8 @@ SLOW_ORDINATES = 8
 _SPECTRUM_POINTS = 512
 # In SI units, below the noise of every sensor: a recording of an ideal simulation may leave nothing at all.
 LEAST_DEVIATION = 1e-6
+# Part of what a model may misjudge of slips that it always does: some twentieth of them in all.
+LEAST_SLIPS = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,14 +219,39 @@ def huber_weights(standardised: FloatArray) -> FloatArray:
 
 def reliability(problem: RegressionProblem, residual: FloatArray, robust: bool) -> FloatArray:
     """Weights of samples (T, C) besides the noise: what channels tell, where the model guesses, and `robust`: outliers."""
-    weights = np.ones_like(residual)
+    weights, misjudged = np.ones_like(residual), seen_misjudged(problem, residual, LEAST_SLIPS)
     for channel in range(residual.shape[1]):
         values = residual[:, channel]
         deviation = robust_deviation(values[problem.valid[:, channel]])
         weights[:, channel] = problem.channels[channel].information * (huber_weights(values / deviation) if robust else 1.0)
-        if problem.misjudged is not None:
-            weights[:, channel] /= 1.0 + (problem.misjudged[:, channel] / deviation) ** 2
+        if misjudged is not None:
+            weights[:, channel] /= 1.0 + (misjudged[:, channel] / deviation) ** 2
     return weights
+
+
+def seen_misjudged(problem: RegressionProblem, residual: FloatArray, least: float) -> FloatArray | None:
+    """What the model misjudges in each sample (T, C), of slips no more than a residual (T, C) shows; None: nothing.
+
+    The loads of wheels may be anybody's guess, or nearly right: where slips are misjudged, more is left where there is more of
+    them. In each channel the halves of the samples with less and with more of them are compared.
+
+    Args:
+        least: part of what may be misjudged of slips that is in any case.
+    """
+    if problem.misjudged is None or problem.misjudged_slips is None:
+        return problem.misjudged
+    found = problem.misjudged.copy()
+    for channel, slips in enumerate(problem.misjudged_slips.T):
+        valid = problem.valid[:, channel]
+        more = valid & (slips > np.median(slips[valid])) if valid.any() else valid
+        less = valid & ~more
+        if not more.any():
+            continue
+        left = [robust_deviation(residual[rows, channel]) ** 2 for rows in (more, less)]
+        may_be = [float(np.mean(slips[rows] ** 2)) for rows in (more, less)]
+        part = np.clip((left[0] - left[1]) / max(may_be[0] - may_be[1], 1e-300), least**2, 1.0)
+        found[:, channel] = np.sqrt(np.maximum(found[:, channel] ** 2 - (1.0 - part) * slips**2, 0.0))
+    return found
 
 
 def robust_deviation(values: FloatArray) -> float:

@@ -49,6 +49,8 @@ EVALUATIONS, CLOSE_ENOUGH = 500, 0.05  # of a descent: at most, and [nats] to th
 NEXT, SETTLING, MOST_AGAIN = 0.15, 150, 100
 # Evaluations of a walk to the furthest that does as well; sides per nat that it is not worth, and of which it is the end.
 REACHING, OUTSIDE, REACHED = 150, 1.0, 1e-3
+# Outlines that other recordings are asked about, and mean sides that they are apart.
+OTHERS, OTHERWISE = 8, 0.15
 WORST = 1e12  # instead of an outline that cannot be
 NARROWEST = 0.05  # [m], about a tyre's contact patch
 NEARLY = 3.0  # nats below the best that an outline of an earlier search may have been
@@ -81,6 +83,19 @@ class Outlines:
         sizes = self.coefficients[near]
         shape = {name: (float(a), float(b)) for name, a, b in zip(OUTLINE, low, high, strict=True)}
         return shape, np.stack([sizes.min(axis=0), sizes.max(axis=0)], axis=1)
+
+
+    def apart(self, own: Mapping[str, float], drop: float) -> list[dict[str, float]]:
+        """Shapes of those within a drop of the best [nats] that differ from an outline and from each other, best first."""
+        chosen = [np.array([own[name] for name in OUTLINE])]
+        for k in np.argsort(-self.evidence):
+            outline = self.outlines[k]
+            side = 0.5 * float(outline[2] + outline[3])
+            if len(chosen) > OTHERS or self.evidence[k] < self.evidence.max() - drop:
+                break
+            if all(np.abs(outline[:4] - other[:4]).sum() > OTHERWISE * side for other in chosen):
+                chosen.append(outline)
+        return [dict(zip(OUTLINE, outline.tolist(), strict=True)) for outline in chosen[1:]]
 
 
 def has_outline(instance: Instance) -> bool:

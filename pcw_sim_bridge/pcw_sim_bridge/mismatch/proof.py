@@ -37,6 +37,8 @@ LEAST_PROBABILITY = 0.01  # of a name: below it stands for another one
 AT_WORK = 5.0
 # Standard errors by which held-out data have to fall short of what an effect, if it is there, does for them on average.
 SHORT_OF = 3.0
+# By so much [nats] has held-out data to be foretold better with an effect that the fitted ones may speak against a little.
+BORNE_OUT = 10.0
 LEAST_WINDOWS = 5  # of which a simulation must have stayed within bounds to speak against an effect
 # Of the description's error in a simulation; what adds less to the error is not told from numbers that were re-tuned.
 TELLING_PART = 0.1
@@ -57,6 +59,7 @@ EVENT_SHARE = 0.1
 
 Retune = Callable[[Explanation], Mapping[str, float]]
 Reduce = Callable[[Explanation, Sequence[Instance]], Explanation]
+Exchange = Callable[[Explanation, Instance, Instance], Explanation]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +118,7 @@ class Prover:
         held_out: Sequence[Opened],
         retune: Retune,
         reduce: Reduce,
+        exchange: Exchange,
         rng: np.random.Generator,
     ) -> None:
         """Open the held-out data.
@@ -125,10 +129,11 @@ class Prover:
             held_out: other recordings, or nothing: then manoeuvres of the fitted ones are held out.
             retune: explanation -> numbers of the description that go into the patch.
             reduce: explanation, effects that stay -> the explanation by these alone.
+            exchange: explanation, an effect, one in its place -> the explanation with that.
             rng: of bootstrap and noise.
         """
         self.besides = False
-        self.subject, self.retune, self.reduce, self.rng = subject, retune, reduce, rng
+        self.subject, self.retune, self.reduce, self.exchange, self.rng = subject, retune, reduce, exchange, rng
         self._problem_with = subject.problem_with(held_out) if held_out else None
         # Candidates that nothing is found of would be most of the work.
         self._made: set[str] = set()
@@ -164,7 +169,14 @@ class Prover:
             self.laws = LawModels(explanation, refused)
             held_out = self._held_out(explanation)
             after = None
-            useless, simulated = self._impossible(explanation, held_out) or self._useless(explanation, held_out), None
+            useless, simulated = self._impossible(explanation, held_out), None
+            if useless is None and (useless := self._useless(explanation, held_out)) is not None:
+                instead = self._instead(explanation, held_out, useless[0], refused)
+                if instead is not None:
+                    explanation, step, note = instead
+                    dropped.append(step)
+                    notes.append(note)
+                    continue
             if useless is None:
                 after = self._rollout(explanation, held_out)
                 simulated = self._misleading(explanation, held_out, after)
@@ -348,6 +360,35 @@ class Prover:
             if work > AT_WORK and nats <= least:
                 found.append((nats, index))
         return (min(found)[1], "the error is no smaller with it") if found else None
+
+    def _instead(
+        self, explanation: Explanation, held_out: HeldOut, index: int, refused: Collection[Instance]
+    ) -> tuple[Explanation, LadderFinding, str] | None:
+        """The explanation with another effect in the place of one that held-out data contradict, where they bear that out.
+
+        Two that the fitted recordings cannot tell apart others may: frictions at one speed, borders of a patch that few wheels
+        crossed. None where none helps as clearly as fitted ones may speak against it, or something else would be left there.
+        """
+        own, search = held_out.instances[index], explanation.search
+        nats, work = held_out.help_of(index)
+        if self.other is None or work < AT_WORK or own in self.laws.laws:
+            return None
+        here, laws, label = search.place, self.laws, search.label(own)
+        search.contradicted.add(own.term)
+        for rival in search.stand_ins(explanation.selection, own):
+            instead = self.exchange(explanation, own, rival)
+            self.laws = LawModels(instead, refused)
+            judged = self._held_out(instead)
+            found = [k for k in judged.proposed if judged.instances[k].term == rival.term]
+            helps = judged.help_of(found[0])[0] if found else -math.inf
+            leaves_more = len(instead.leftovers) > len(explanation.leftovers)
+            if helps > BORNE_OUT and not leaves_more and not self._useless(instead, judged):
+                named = search.label(judged.instances[found[0]])
+                step = LadderFinding(f"exchange {label} for {named}", helps, helps - nats, "borne out held out")
+                said = f"{label} does as well as {named} where it was fitted. Held out {named} helps, and it does not."
+                return instead, step, said
+            search.place, self.laws = here, laws
+        return None
 
     def _impossible(self, explanation: Explanation, held_out: HeldOut) -> tuple[int, str] | None:
         """An effect with which the patched robot cannot be, and without which it can; the first if that is none of them."""

@@ -302,7 +302,8 @@ class RegressionProblem:
         measured: the measured side of each channel (T, C), for error ratios; residual = measured - predicted.
         valid: samples that may be judged (T, C).
         variables: what a leftover may depend on: name -> (T,).
-        misjudged: standard deviation of what the model itself misjudges in each sample, besides noise (T, C); None: of none.
+        misjudged: standard deviation of what the model itself may misjudge in each sample, besides noise (T, C); None: of
+            none. misjudged_slips: of that what it may misjudge of slips, where a residual shows how much of it there is.
         scale_deviation: relative deviation of the measured side that no nuisance holds; what is measured against it is
             known no better, and an effect that is no larger and looks alike is not told from it.
         drifts: columns (T, C, K) of the model's own errors, which may vary slowly; None: no effect looks otherwise than these.
@@ -336,6 +337,7 @@ class RegressionProblem:
     terms: tuple[Term, ...]
     variables: Mapping[str, FloatArray]
     misjudged: FloatArray | None = None
+    misjudged_slips: FloatArray | None = None
     scale_deviation: float = 0.0
     drifts: FloatArray | None = None
     sites: Sites | None = None

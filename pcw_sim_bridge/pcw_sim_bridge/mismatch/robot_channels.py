@@ -65,7 +65,7 @@ SLIP_FLOOR, SLIP_PART = 0.03, 0.75
 GROSS = 3.0  # times that; a tracker or a gyro that parts from all wheels by so much at once says that these spin
 # Part of a tyre's friction up to which its force says how much it slips: at the peak any slip goes with the same force.
 USED_PART = 0.8
-# By about this part the model misjudges slips: the loads of four wheels on a floor that is not quite flat are anybody's guess.
+# By up to about this part the model misjudges slips: the loads of four wheels on a floor that is not flat are anybody's guess.
 SLIP_DEVIATION = 0.3
 ROLLS_TRUE = 1e-5  # [m/s]; no wheel and no floor is so true that what wheels slip by less says anything
 TILT_DEVIATION = 1e-3  # [rad]; floors are no more level, and no chassis on its wheels stands any straighter
@@ -166,6 +166,7 @@ class RobotProblemBuilder:
             left, deviation = remainder(differences.residual, valid, nuisances)
             looked = Looked(left, deviation, valid, time, recording, rate, angle, places, headings)
             terms = tuple(robot_terms(self.robot, differences, looked, bool(self._leads.any()), keys))
+        slips = self._misjudged_slips(differences)
         exact = functools.partial(self._exact, differences, terms)
         residual, nominal = differences.residual, None
         if self._leads.any() and (found := exact({}, ())):
@@ -183,7 +184,8 @@ class RobotProblemBuilder:
             nuisances=nuisances,
             terms=terms,
             variables=self._variables(along),
-            misjudged=self._misjudged(differences),
+            misjudged=self._misjudged(differences, slips),
+            misjudged_slips=slips,
             scale_deviation=self._scale_deviation(),
             drifts=_drifts(terms) if self.layout.balanced else None,
             sites=self._sites(differences, along) if with_terms and self.layout.balanced else None,
@@ -347,23 +349,18 @@ class RobotProblemBuilder:
         shared = self.robot.tolerance("torque_constant").value / float(np.sqrt(2 * self.robot.n))
         return float(np.hypot(shared, MODEL_DEVIATION)) if self.layout.balanced else 0.0
 
-    def _misjudged(self, differences: ChannelDifferences) -> FloatArray:
-        """What the model misjudges in each sample (T, C): slips, by a part of those there are, and what an IMU leans.
+    def _misjudged(self, differences: ChannelDifferences, slips: FloatArray) -> FloatArray:
+        """What the model may misjudge in each sample (T, C): `slips` (T, C), see below, and what an IMU leans.
 
         Besides what joints lose where their dry friction reverses, what encoders do not resolve, and what drives that hold
         speeds do not report while what accelerates their joints changes: a caster that flips is accelerated anew every moment.
         """
-        found, predicted = np.zeros_like(differences.predicted), differences.predicted
-        lost = [motion.lost for motion in differences.motions if motion.lost is not None]
-        if lost:
-            predicted = predicted - differences.of_torque([own.torque[..., None] for own in lost])[:, :, 0]
-        slips = predicted[:, self.layout.consistency]
-        if slips.size:
-            misjudged = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
-            unknown = np.hypot(self._unresolved(), ROLLS_TRUE)
-            found[:, self.layout.consistency] = np.hypot(misjudged, unknown)
+        found, consistency = slips.copy(), self.layout.consistency
+        if slips[:, consistency].size:
+            found[:, consistency] = np.sqrt(slips[:, consistency] ** 2 + self._unresolved() ** 2 + ROLLS_TRUE**2)
         if self.layout.imu:
             found[:, self.layout.inertial][:, 1:] = GRAVITY * TILT_DEVIATION
+        lost = [motion.lost for motion in differences.motions if motion.lost is not None]
         doubts = [own.doubt for own in lost]
         if self.layout.balanced and any(np.any(motion.loops) for motion in differences.motions):
             # What a report lacks lags behind what accelerates its joint, by about as long as the loop takes.
@@ -373,6 +370,17 @@ class RobotProblemBuilder:
         if doubts:
             each = [by_joint(own.reshape(len(own), -1, 1)) for own in doubts]
             found = np.sqrt(found**2 + np.sum(differences.of_torque(each) ** 2, axis=2))
+        return found
+
+    def _misjudged_slips(self, differences: ChannelDifferences) -> FloatArray:
+        """What the model may misjudge of slips (T, C): a part of those there are."""
+        found, predicted = np.zeros_like(differences.predicted), differences.predicted
+        lost = [motion.lost for motion in differences.motions if motion.lost is not None]
+        if lost:
+            predicted = predicted - differences.of_torque([own.torque[..., None] for own in lost])[:, :, 0]
+        slips = predicted[:, self.layout.consistency]
+        if slips.size:
+            found[:, self.layout.consistency] = SLIP_DEVIATION * np.sqrt(np.mean(slips**2, axis=1, keepdims=True))
         return found
 
     def _unresolved(self) -> FloatArray:

@@ -40,6 +40,9 @@ CHANGED_BY = {
     ("wheel_radius_error", "error"): ("wheel_radius", 1.0),
     ("caster_offset_error", "x"): ("caster_offset.x", 1.0),
     ("caster_offset_error", "y"): ("caster_offset.y", 1.0),
+    ("payload_offset", "x"): ("chassis.com.x", 1.0),
+    ("payload_offset", "y"): ("chassis.com.y", 1.0),
+    ("payload_offset", "z"): ("chassis.com.z", 1.0),
 }
 FREQUENCY_DEVIATION = 0.2  # of the chassis on its springs, relative
 

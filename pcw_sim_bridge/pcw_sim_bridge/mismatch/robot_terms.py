@@ -494,10 +494,10 @@ def _changed(effect: Effect, parameter: EffectParameter, target: Sequence[str]) 
     Of one caster an effect keeps its own columns, which are secants where it is far off: by the numbers' slopes one of two
     wheels that were 0.2 m off was re-tuned.
     """
-    if len(target) == 1 or (effect.name, parameter.name) not in CHANGED_BY:
-        return ()
-    number, factor = CHANGED_BY[effect.name, parameter.name]
-    return tuple((f"{number}/{caster}", factor) for caster in target)
+    number, factor = CHANGED_BY.get((effect.name, parameter.name), ("", 0.0))
+    if effect.target_kind == "chassis":
+        return ((number, factor),) if number else ()
+    return tuple((f"{number}/{caster}", factor) for caster in target) if number and len(target) > 1 else ()
 
 
 def _step(parameter: EffectParameter, neutral: float) -> tuple[float, float]:

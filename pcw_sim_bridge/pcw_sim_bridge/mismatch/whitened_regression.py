@@ -34,6 +34,7 @@ PIECE = 1.0  # of a recording, long enough for the errors of one to say little o
 RETUNED_SHARE = 0.05
 # By so much more may a size come out to first order than there can be: numbers beside it multiply it.
 CURVED_ROOM = 2.0
+ROUNDING = 1e-12  # of the largest square in a matrix of some hundred rows
 TRIED_BYTES = 2**26  # of columns of shapes that were only tried
 TOGETHER = 40  # shapes whose columns are whitened in one go
 FINITE = 2.0  # deviations, by which an inverse has to be told from zero
@@ -621,7 +622,13 @@ def _solve(gram: FloatArray, deviations: FloatArray) -> tuple[FloatArray, FloatA
     k = len(deviations)
     scaled = gram[:k, :k] * np.outer(deviations, deviations) + np.eye(k)
     moment = gram[:k, k] * deviations
-    factor = np.linalg.cholesky(scaled)
+    try:
+        factor = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        # The model was followed to where it leaves so much that rounding swallows the prior: that place has no evidence in any
+        # case, and a prior as large as the rounding says so.
+        scaled += ROUNDING * float(np.max(np.diag(scaled))) * np.eye(k)
+        factor = np.linalg.cholesky(scaled)
     half = np.linalg.solve(factor, moment)
     inverse = np.linalg.inv(scaled)
     mean = inverse @ moment * deviations
