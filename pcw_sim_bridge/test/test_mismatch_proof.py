@@ -909,4 +909,7 @@ def test_a_look_alike_that_other_recordings_bear_out_stands_in_for_one_that_they
         return
     assert found is not None and search.contradicted == {0}
     assert found[0] is instead and found[1].description == "exchange viscous for coulomb" and found[1].gain == 25.0
-    assert found[2] == "viscous does as well as coulomb where it was fitted. Held out coulomb helps, and it does not."
+    assert found[2] == (
+        "viscous does as well as coulomb where it was fitted. Held out coulomb helps, and it does not: that is proposed, "
+        "and the errors after it are of data that chose it."
+    )

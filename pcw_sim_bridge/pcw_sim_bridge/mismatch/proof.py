@@ -385,7 +385,10 @@ class Prover:
             if helps > BORNE_OUT and not leaves_more and not self._useless(instead, judged):
                 named = search.label(judged.instances[found[0]])
                 step = LadderFinding(f"exchange {label} for {named}", helps, helps - nats, "borne out held out")
-                said = f"{label} does as well as {named} where it was fitted. Held out {named} helps, and it does not."
+                said = (
+                    f"{label} does as well as {named} where it was fitted. Held out {named} helps, and it does not: that is "
+                    "proposed, and the errors after it are of data that chose it."
+                )
                 return instead, step, said
             search.place, self.laws = here, laws
         return None
