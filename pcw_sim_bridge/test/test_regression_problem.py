@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -323,6 +324,35 @@ def test_steps_that_swing_about_a_number_are_shortened():
         _, arrived = search._arrived(regression, regression.fit(()), rounds)
         squares.append(float(arrived @ arrived))
     assert squares[1] < 0.1 * squares[0]
+
+
+@pytest.mark.parametrize(("there", "taken"), [(200.0, True), (0.5, False)])
+def test_the_same_effects_at_a_better_place_that_a_look_alike_led_to_are_kept(there: float, taken: bool) -> None:
+    """That place was thrown away with the look-alike, which then seemed to do by far more: the right name was withdrawn."""
+    own, rival = Instance(0, (), (0,)), Instance(1, (), (0,))
+    left = np.zeros(3)
+    regression = SimpleNamespace(
+        moved=lambda problem: regression, fit=lambda instances: instances, odds=lambda gain, mine, theirs: gain
+    )
+    first, second = (
+        SimpleNamespace(fit=SimpleNamespace(instances=(own,)), regression=regression, threshold=9.0) for _ in range(2)
+    )
+
+    def settled(selection: object, threshold: float) -> SimpleNamespace:
+        search.problem, search._point = problem, "elsewhere"
+        return second
+
+    problem = SimpleNamespace(terms=[SimpleNamespace(is_curved=True)] * 2)
+    search = SimpleNamespace(
+        problem=problem, _point="here", where_exact={}, label=str, progress=lambda message: None,
+        _alike=lambda selection, others, instance: [rival] if selection is first else [], _is_strained=lambda fit: False,
+        _reached=lambda noise, fit: (140.0 if fit == (rival,) else 0.0, left), _reached_with=lambda *rest: (there, left),
+        conclude=lambda instances, threshold: None, settle_on=settled,
+        against_alike=lambda selection: EffectSearch.against_alike(search, selection),  # type: ignore[arg-type]
+    )  # fmt: skip
+    assert search.against_alike(first) is (second if taken else first)
+    assert search._point == ("elsewhere" if taken else "here")
+    assert search.where_exact == {(0, 1): 140.0 - there if taken else 140.0}
 
 
 def test_a_place_where_rounding_swallows_the_prior_has_no_evidence_and_ends_no_search():

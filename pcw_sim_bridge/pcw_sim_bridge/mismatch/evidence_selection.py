@@ -405,9 +405,10 @@ class EffectSearch(SetGrowth):
                         return instead
                     # Beside the other one numbers may have moved to where the effect itself does more than either did before.
                     if _terms(instead.fit.instances) == _terms(instances):
-                        better = self._reached_with(selection.regression, instead.fit.instances)[0] - own[0]
-                        if better > STEADY_EVIDENCE:
-                            self.progress(f"the same where that led: {better:.1f} nats more")
+                        reached, own_left = self._reached_with(selection.regression, instead.fit.instances)
+                        if reached - own[0] > STEADY_EVIDENCE:
+                            self.progress(f"the same where that led: {reached - own[0]:.1f} nats more")
+                            self.where_exact[instance.term, rival.term] = regression.odds(evidence - reached, own_left, left)
                             return self.against_alike(instead)
             self.problem, self._point = here  # the selection is exact there
         return selection
