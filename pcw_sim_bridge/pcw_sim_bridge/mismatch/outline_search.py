@@ -84,7 +84,6 @@ class Outlines:
         shape = {name: (float(a), float(b)) for name, a, b in zip(OUTLINE, low, high, strict=True)}
         return shape, np.stack([sizes.min(axis=0), sizes.max(axis=0)], axis=1)
 
-
     def apart(self, own: Mapping[str, float], drop: float) -> list[dict[str, float]]:
         """Shapes of those within a drop of the best [nats] that differ from an outline and from each other, best first."""
         chosen = [np.array([own[name] for name in OUTLINE])]

@@ -34,7 +34,8 @@ LOOP_BANDWIDTH, LARGEST_UNREPORTED = 50.0, 0.3
 # Numbers of tyres, and how late a wheel follows its heading, which is the later the more its contact yields: most of all in
 # other simulations, by soft constraints.
 LOOSE = ("contact.", "heading_lead")
-# What parameters of effects change per unit: the beginnings of names of numbers, one of each caster, and by how much.
+# What parameters of effects change per unit: a number of the chassis, or the beginnings of names of one of each caster, and by
+# how much.
 CHANGED_BY = {
     ("steer_zero_offset", "offset"): ("steer_zero", -1.0),
     ("wheel_radius_error", "error"): ("wheel_radius", 1.0),

@@ -489,7 +489,7 @@ def _only(effect: Effect, parameter: EffectParameter) -> dict[str, float]:
 
 
 def _changed(effect: Effect, parameter: EffectParameter, target: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Numbers of the description of several casters that a parameter changes and nothing else, by name, and how much per unit.
+    """Numbers of the chassis or of several casters that a parameter changes and nothing else, by name, and how much per unit.
 
     Of one caster an effect keeps its own columns, which are secants where it is far off: by the numbers' slopes one of two
     wheels that were 0.2 m off was re-tuned.
