@@ -44,6 +44,7 @@ from pcw_sim_bridge.mismatch.challenge.healthy_deviations import (
     effect_instance,
     healthy_numbers,
     tolerated_cost,
+    tuned_within,
     with_deviations,
 )
 from pcw_sim_bridge.mismatch.challenge.outside_effects import OUTSIDE_EFFECTS, CrossJointLaw
@@ -477,6 +478,34 @@ def test_one_way_of_tyres_is_not_hidden_by_making_another_effect_of_it() -> None
     assert retuned and "contact.stiffness" not in retuned
 
 
+@pytest.mark.parametrize(
+    ("name", "wanted", "own", "tuned"),
+    [
+        ("caster_offset.x", 2.0, 1.0, 2.0),  # as wanted
+        ("caster_offset.x", 5.0, 1.0, 2.0),  # too far from the description
+        ("caster_offset.x", 2.0, -2.0, 0.0),  # too far from the robot
+        ("chassis.com.x", -1.5, 2.5, 0.5),
+        ("module.mass", 2.0, -1.0, 1.0),
+        ("contact.relaxation_length", -3.0, 1.0, None),
+        ("contact.stiffness", 3.0, -1.4, None),
+    ],
+)
+def test_what_is_tuned_stays_near_description_and_robot(name: str, wanted: float, own: float, tuned: float | None) -> None:
+    """Of a relaxation length tuned to a quarter, half is a quarter of what it was: the robot itself would be another one."""
+    robot = load_robot("flow_base")
+    key = f"{name}/{robot.caster_names[0]}" if name.startswith("caster") else name
+    deviation = next(number.deviation for number in healthy_numbers(robot) if number.name == key)
+    found = tuned_within(robot, key, wanted * deviation, own * deviation)
+    if tuned is not None:
+        assert found / deviation == pytest.approx(tuned, abs=0.06)
+        return
+    described, true = with_deviations(robot, {key: found}).contact, with_deviations(robot, {key: own * deviation}).contact
+    part = "relaxation_length" if name.endswith("length") else "lambda_p"
+    apart = getattr(true, part) / getattr(described, part) - 1.0
+    assert abs(apart) <= 1.41 * robot.tolerance(name).value
+    assert (found - own * deviation) * (wanted - own) > 0.0
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize("masking", MASKINGS)
 def test_masked_cases_are_masked(masking: str) -> None:
@@ -489,6 +518,8 @@ def test_masked_cases_are_masked(masking: str) -> None:
         assert answer["retuned"] and with_deviations(own.nominal, {}) != with_deviations(own.true, {})
         limits = {number.name: number.deviation for number in healthy_numbers(own.nominal)}
         assert max(abs(value) / limits[name] for name, value in answer["retuned"].items()) < 2.3  # of what is nominal now
+        apart = {name: answer["deviations"][name] - value for name, value in answer["retuned"].items()}
+        assert max(abs(value) / limits[name] for name, value in apart.items()) < 2.3
     elif masking == "closed_loop":
         assert own.controller == "velocity_loops"
     elif masking == "cancelling":

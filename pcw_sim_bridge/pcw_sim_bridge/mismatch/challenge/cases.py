@@ -36,7 +36,13 @@ from .concealed_effects import (
     first_on_patch,
 )
 from .effect_size import EffectSize, HealthyChannels
-from .healthy_deviations import draw_deviations, effect_instance, healthy_numbers, with_deviations
+from .healthy_deviations import (
+    draw_deviations,
+    effect_instance,
+    healthy_numbers,
+    tuned_within,
+    with_deviations,
+)
 from .outside_effects import OUTSIDE_EFFECTS
 from .random_robots import draw_robot
 from .simulated_case import Run, SimulatedRecording, World, simulate
@@ -68,8 +74,6 @@ SHARE_OF_TWO_RECORDINGS = 0.25
 NOT_HIDDEN_BY: Mapping[str, tuple[str, ...]] = {
     "tyre_longitudinal_stiffness": ("contact.stiffness",), "tyre_lateral_stiffness": ("contact.stiffness",),
 }  # fmt: skip
-# What somebody tunes to make the effect go away stays so near to the description, in standard deviations.
-RETUNED_WITHIN = 2.0
 NOISE_RANGE = (0.5, 2.5)
 PROBES = 6
 # Draws of a case: one whose effects stay below the floor is drawn anew; of so many draws, the one that shows most is kept.
@@ -333,13 +337,17 @@ class _Drawing:
         return measured[factor]
 
     def _retune(self, size: EffectSize, channels: HealthyChannels, effect: str) -> None:
-        """Move the numbers of the description to where they hide the effect best; the controller believes them too."""
+        """Move the numbers of the description to where they hide the effect best; the controller believes them too.
+
+        The robot stays a healthy one but for the effect: a number tuned one way, of a robot that is off the other way, could
+        leave both further apart than the description's tolerance, and that would be another answer, and as right.
+        """
         nominal = {nuisance.name: nuisance.nominal for nuisance in channels.problem.nuisances}
         for number in healthy_numbers(self._base):
             if number.described and number.name in size.retuned and number.name not in NOT_HIDDEN_BY.get(effect, ()):
                 relative = nominal[number.name] if number.name.startswith("rotors") else 1.0
-                widest = RETUNED_WITHIN * number.deviation
-                self._retuned[number.name] = float(np.clip(size.retuned[number.name] / relative, -widest, widest))
+                wanted = float(size.retuned[number.name] / relative)
+                self._retuned[number.name] = tuned_within(self._base, number.name, wanted, self._deviations[number.name])
         self._world = dataclasses.replace(self._world, nominal=with_deviations(self._base, self._retuned))
 
     def _entry(self, instance: EffectInstance, size: EffectSize, healthy: SimulatedRecording) -> dict[str, Any]:

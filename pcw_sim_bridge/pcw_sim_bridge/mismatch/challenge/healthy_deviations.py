@@ -23,9 +23,12 @@ Change = Callable[[RobotDescription, float], RobotDescription]
 # Healthy robots are no further off than this, in standard deviations; a tyre's stiffness and relaxation cannot vanish.
 LARGEST_DEVIATION = 2.5
 LARGEST_TYRE_DEVIATION = 1.4
+# What somebody tunes stays so near to the description, and so near to the robot, in standard deviations.
+TUNED_WITHIN = 2.0
 # No tyre gives less than this part of what is described, however it is drawn or tuned.
 STIFFEST = 0.2
 RELAXATION = "contact.relaxation_length"
+TYRE_NUMBERS = ("contact.stiffness", RELAXATION)
 # Effects that move healthy numbers: which number each of their parameters moves.
 MOVED: Mapping[str, Mapping[str, str]] = {
     "wheel_radius_error": {"error": "wheel_radius/{caster}"},
@@ -84,7 +87,7 @@ def draw_deviations(robot: RobotDescription, rng: np.random.Generator) -> dict[s
     """Draw how far a healthy robot is off, by the names of `healthy_numbers`."""
     drawn = {}
     for number in healthy_numbers(robot):
-        widest = LARGEST_TYRE_DEVIATION if number.name in ("contact.stiffness", RELAXATION) else LARGEST_DEVIATION
+        widest = LARGEST_TYRE_DEVIATION if number.name in TYRE_NUMBERS else LARGEST_DEVIATION
         drawn[number.name] = number.deviation * float(np.clip(rng.standard_normal(), -widest, widest))
     return drawn
 
@@ -102,6 +105,35 @@ def with_deviations(robot: RobotDescription, deviations: Mapping[str, float]) ->
         if deviation != 0.0:
             robot = numbers[name].change(robot, deviation)
     return robot
+
+
+def tuned_within(robot: RobotDescription, name: str, wanted: float, own: float) -> float:
+    """Return how far to tune a number of the description: as wanted, as far as description and robot stay near it.
+
+    Args:
+        robot: the description.
+        name: one of `healthy_numbers`.
+        wanted: deviation that somebody would tune to.
+        own: deviation of the robot itself. From the tuned description it is off by TUNED_WITHIN standard deviations at
+            most, of the tuned description's own: half of a relaxation length is half of the one that stands there then.
+    """
+    deviation = _number(robot, name).deviation
+    widest = LARGEST_TYRE_DEVIATION if name in TYRE_NUMBERS else TUNED_WITHIN
+    wanted = float(np.clip(wanted, -widest * deviation, widest * deviation))
+    for part in np.linspace(1.0, 0.0, 101):
+        tuned = own + float(part) * (wanted - own)
+        off = (1.0 + own) / (1.0 + tuned) - 1.0 if _is_relative(name) else own - tuned
+        if abs(off) <= widest * _number(with_deviations(robot, {name: tuned}), name).deviation:
+            break
+    return tuned
+
+
+def _number(robot: RobotDescription, name: str) -> HealthyNumber:
+    return next(number for number in healthy_numbers(robot) if number.name == name)
+
+
+def _is_relative(name: str) -> bool:
+    return name != RELAXATION and name.startswith(("rotors.", "contact."))
 
 
 def tolerated_cost(robot: RobotDescription, instance: EffectInstance) -> float:
