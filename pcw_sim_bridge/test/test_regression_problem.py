@@ -212,6 +212,61 @@ def test_the_interval_of_a_shape_holds_it_where_the_problem_is_exact():
     assert np.median(widths) == pytest.approx(expected, rel=0.2)
 
 
+def placed_problem(place: float, tolerance: float) -> RegressionProblem:
+    """A load at a place, a centre that is known to a tolerance and does what the place does, and springs that both lean on."""
+    time = np.arange(SAMPLES) / RATE
+    turning, leaning, weighing, accelerating = (np.sin(f * time)[:, None] for f in (2.1, 3.7, 5.3, 7.9))
+    noise = NOISE * np.random.default_rng(6).standard_normal((SAMPLES, 1))
+
+    def model(load: float, at: float, centre: float, softness: float) -> np.ndarray:
+        moment = load * at + centre
+        return load * weighing + moment * turning + softness * (moment * leaning + accelerating)
+
+    measured = model(2.0, place, 0.0, 1.0) + noise
+
+    def values(changes, sizes):
+        load, at = (float(sizes[0].coefficients[0]), dict(sizes[0].shape)["x"]) if sizes else (0.0, 0.0)
+        return load, at, changes.get("centre", 0.0), changes.get("softness", 0.0)
+
+    def exact(changes, sizes):
+        return measured - model(*values(changes, sizes)), ["centre", "softness"]
+
+    def derive(changes, sizes):
+        load, at, centre, softness = values(changes, sizes)
+        moment = load * at + centre
+        return {"centre": turning + softness * leaning, "softness": moment * leaning + accelerating}
+
+    return one_channel(
+        measured[:, 0],
+        measured[:, 0],
+        nuisances=(
+            Nuisance("centre", "m", 0.0, tolerance, turning),
+            Nuisance("softness", "1", 0.0, 1.0, accelerating),
+        ),
+        terms=(
+            Term(
+                "load", ("axis",), (LinearParameter("mass", "kg", 0.0, 100.0, 3.0),), ({"x": 0.0}, {"x": 0.5}),
+                lambda shape: (weighing + shape["x"] * turning)[:, :, None], is_exact=True, is_curved=True,
+                resolution={"x": ("linear", 0.5)},
+            ),
+        ),
+        exact=exact, derive=derive,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.02])
+def test_a_place_is_known_as_well_as_the_centre_that_does_the_same(moved: float) -> None:
+    """Also where a last search has moved it from where the problem is exact: columns of the description do not lean."""
+    search = EffectSearch(placed_problem(0.3, 0.2), np.random.default_rng(0), SelectionSettings(surrogates=20))
+    [found] = search.made_exact((Instance(0, (("x", 0.3),), (0,)),))
+    instance = dataclasses.replace(found, shape=(("x", dict(found.shape)["x"] + moved),))
+    point = search.problem.point
+    estimate = named_terms(search, search.conclude((instance,), 5.0))[0].estimates["x"]
+    assert estimate.low <= 0.3 <= estimate.high
+    assert estimate.high - estimate.low == pytest.approx(2.0 * 1.96 * 0.2 / 2.0, rel=0.1)
+    assert search.problem.point is point  # the search goes on from where it was
+
+
 def turned_problem(angle: float, tolerance: float) -> RegressionProblem:
     """An angle that is off by so much, a number of the description with a tolerance, and an effect that turns it further."""
     time = np.arange(SAMPLES) / RATE

@@ -573,11 +573,16 @@ class EffectSearch(SetGrowth):
         if instance is None or term not in self.outlines:
             return
         others = tuple(other for other in selection.fit.instances if other != instance)
+        regression = selection.regression.moved(self.exact_problem(selection).with_secants(term, instance.shape))
+        self.outlines[term] = reaching(regression, others, instance, self.outlines[term], DROP)
+
+    def exact_problem(self, selection: Selection) -> RegressionProblem:
+        """Return the problem as it is exact at a selection with just the shapes that it has; the search goes on from its own."""
         here = self.problem, self._point
         self._be_exact_at(selection)
-        regression = selection.regression.moved(self.problem.with_secants(term, instance.shape))
-        self.outlines[term] = reaching(regression, others, instance, self.outlines[term], DROP)
+        problem = self.problem
         self.problem, self._point = here
+        return problem
 
     def _be_exact_at(self, selection: Selection) -> None:
         """Make the problem exact at a selection with just the shapes that it has, which a search of shapes may have moved."""

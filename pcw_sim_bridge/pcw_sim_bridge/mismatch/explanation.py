@@ -631,7 +631,8 @@ def _estimates(problem: RegressionProblem, fit: Fit) -> list[FloatArray]:
 
 def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, ...]:
     """Numbers, intervals, probability and look-alikes of every effect of a selection."""
-    problem, regression, fit = search.problem, selection.regression, selection.fit
+    # By columns of another place a payload's place would be told from the centre of mass that does the same.
+    problem, regression, fit = search.exact_problem(selection), selection.regression, selection.fit
     # How large an effect is and which shape it has are known together: a payload that is nearer may be heavier.
     sloped, slopes = with_slopes(problem.tangent(), fit.instances, _estimates(problem, fit), search.outlines)
     there = regression if sloped is problem else regression.moved(sloped)
