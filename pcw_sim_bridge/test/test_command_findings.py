@@ -13,6 +13,7 @@ from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulat
 from pcw_sim_bridge.mismatch.command_findings import command_findings, with_rivals
 from pcw_sim_bridge.mismatch.command_tracking import command_problems
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
+from pcw_sim_bridge.mismatch.held_commands import held_commands
 from pcw_sim_bridge.mismatch.reported_torques import coarse_step, doubtful_reports, told_of, unlikely_factor
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -211,6 +212,51 @@ def test_stamps_that_tremble_are_no_dead_time(later):
     commands = dataclasses.replace(commands, stamp=tremble(commands.stamp))
     recording = dataclasses.replace(recording, joint_states=joints, joint_commands=commands)
     assert command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None).named == ()
+
+
+def through_a_busy_network(recording, part, lost, seed=2):
+    """The recording with stamps that tremble by up to so much of a cycle either way, and with a part of its messages lost."""
+    rng = np.random.default_rng(seed)
+    joints, commands = recording.joint_states, recording.joint_commands
+
+    def received(series, fields):
+        cycle = np.median(np.diff(series.stamp))
+        stamp = np.maximum.accumulate(series.stamp + part * cycle * rng.uniform(-1.0, 1.0, len(series)))
+        kept = rng.random(len(series)) >= lost
+        values = {name: getattr(series, name)[kept] for name in fields}
+        return dataclasses.replace(series, stamp=stamp[kept], stamp_ns=series.stamp_ns[kept], **values)
+
+    return dataclasses.replace(
+        recording, joint_states=received(joints, ("position", "velocity", "effort")),
+        joint_commands=received(commands, ("effort",)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("part", "lost"), [(0.0, 0.02), (0.25, 0.0), (0.25, 0.03)])
+def test_a_busy_network_is_no_drive_that_lags(part, lost):
+    """A command that took the place of the next, or of one that was lost, was a lag of all drives by half a cycle."""
+    recording = through_a_busy_network(simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), ()), part, lost)
+    held, joints = held_commands(ROBOT, recording), recording.joint_states
+    problems = command_problems(ROBOT, [recording])
+    assert len(problems) == 2 * ROBOT.n
+    # What was lost is known to be, but for few of which tremble hides it, and the rest is what was reported.
+    assert np.mean(np.isnan(held[1:])) == pytest.approx(lost, abs=0.004)
+    rest = joints.effort - held
+    noise = np.sqrt(np.nanmean((joints.effort - np.roll(joints.effort, 1, axis=0)) ** 2))
+    assert np.nanmean(np.abs(rest) > noise) < 0.01
+    for problem in problems:
+        assert problem.valid.mean() == pytest.approx((1.0 - lost) ** 3, abs=0.01)
+    findings = command_findings(problems, (), 0, None, lambda message: None)
+    assert not findings.named and not findings.leftovers
+
+
+def test_a_drive_that_lags_is_found_through_a_busy_network():
+    lag = EffectInstance("actuator_lag", ROBOT.caster_names, {"time_constant": 0.004}, "drive")
+    recording = through_a_busy_network(simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), [lag]), 0.25, 0.03)
+    findings = command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None)
+    [(named, instance)] = findings.named
+    assert (named.term.effect, instance.target, instance.axis) == ("actuator_lag", ROBOT.caster_names, "drive")
+    assert named.estimates["time_constant"].value == pytest.approx(0.004, rel=0.1)
 
 
 @pytest.mark.parametrize(("controller", "told"), [("computed_torque", False), ("velocity_loops", True)])

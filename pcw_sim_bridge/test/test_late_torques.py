@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
@@ -12,7 +13,7 @@ from pcw_sim_bridge.mismatch.command_findings import CommandFindings, command_fi
 from pcw_sim_bridge.mismatch.command_tracking import command_problems, joints_that_report_commands
 from pcw_sim_bridge.mismatch.explanation import explain
 from pcw_sim_bridge.mismatch.held_commands import held_commands
-from pcw_sim_bridge.mismatch.late_torques import TORQUE_LAG, with_late_torques
+from pcw_sim_bridge.mismatch.late_torques import TORQUE_LAG, with_late_torques, without_late_reports
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
 
 ROBOT = load_robot("thesis")
@@ -85,3 +86,52 @@ def test_of_a_drive_that_is_described_as_late_such_reports_say_nothing():
     assert joints_that_report_commands(patched, [echoed]) == list(ROBOT.joint_names)
     assert joints_that_report_commands(patched, [recording]) == []
     assert len(command_problems(ROBOT, [echoed])) == 2 * ROBOT.n
+
+
+LAG = 0.004
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    """By whether drives lag: a recording in which reports follow commands late, and what its motion says."""
+    found = {}
+    for drives in (True, False):
+        each = {"time_constant": LAG}
+        effects = [EffectInstance("actuator_lag", ROBOT.caster_names, each, axis) for axis in ("drive", "steer")]
+        recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), effects if drives else ())
+        if not drives:
+            joints = recording.joint_states
+            kept = np.exp(-np.median(np.diff(joints.stamp)) / LAG)
+            start = np.nan_to_num(joints.effort[:1]) * kept
+            effort, _ = signal.lfilter([1.0 - kept], [1.0, -kept], joints.effort, axis=0, zi=start)
+            recording = dataclasses.replace(recording, joint_states=dataclasses.replace(joints, effort=effort))
+        explanation = explain(RobotProblemBuilder(ROBOT, [recording]).build(), np.random.default_rng(0))
+        problems = command_problems(ROBOT, [recording])
+        found[drives] = command_findings(problems, (), 0, None, silent), problems, explanation
+    return found
+
+
+def test_reports_that_are_filtered_are_no_drives_that_lag(lagging):
+    """The lag is between commands and reports as where drives lag; the robot moves by torques before they are reported."""
+    between, problems, explanation = lagging[False]
+    assert {named.term.effect for named, _ in between.named} == {"actuator_lag"}
+    found = without_late_reports(between, problems, explanation)
+    assert not found.named and not found.locations
+    assert "it is the reports that are late" in found.notes[-1]
+    assert found.numbers == (TORQUE_LAG,)
+    assert [proof.after for proof in found.proofs] == [proof.before for proof in between.proofs]
+    assert any(channel.flagged for channel in found.channels)
+
+
+def test_drives_that_lag_stay_named_where_the_robot_lags_too(lagging):
+    between, problems, explanation = lagging[True]
+    assert {named.term.effect for named, _ in between.named} == {"actuator_lag"}
+    assert without_late_reports(between, problems, explanation) is between
+
+
+def test_reports_that_are_late_in_some_joints_say_nothing_of_all(lagging):
+    """One number of the motion stands for the torques of all joints."""
+    between, problems, explanation = lagging[False]
+    some = dataclasses.replace(between, named=between.named[:1], locations=between.locations[:1])
+    assert without_late_reports(some, problems, explanation) is some
+    assert without_late_reports(CommandFindings(), problems, explanation) == CommandFindings()

@@ -40,7 +40,7 @@ from .findings import (
     UnknownFinding,
 )
 from .generated_effect import NoSuchKernelError, generate
-from .late_torques import TORQUE_LAG, with_late_torques
+from .late_torques import TORQUE_LAG, with_late_torques, without_late_reports
 from .locations import locate, locate_leftover, walked
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
@@ -164,7 +164,7 @@ def analyse(
     explanation, (commands, commanded, prover, responses) = side_by_side(
         lambda: explain(problem, np.random.default_rng(seed), settings, progress), needs_no_explanation
     )
-    commands = with_late_torques(commands, commanded, explanation)
+    commands = without_late_reports(with_late_torques(commands, commanded, explanation), commanded, explanation)
     progress("proving it on held-out data")
     proof = prover.prove(explanation, bool(commands.named or ripples.named))
     explanation, shaken = beside_ripples(proof.explanation, ripples)

@@ -85,7 +85,7 @@ def command_findings(
     for problem, explanation in zip(problems, _explanations(problems, seed, settings), strict=True):
         rng = np.random.default_rng(seed)
         channel = problem.channels[0]
-        added, floor = np.zeros_like(problem.residual), _size(problem.residual)
+        added, floor = np.zeros_like(problem.residual), _size(problem, problem.residual)
         flagged = False
         if explanation is not None:
             added = _predicted(problem, problem, explanation)
@@ -94,7 +94,7 @@ def command_findings(
             for named in explanation.named:
                 progress(f"{channel.name}: {explanation.search.label(named.instance)}")
         p_value = 1.0 if explanation is None else float(explanation.p_values[0])
-        finding = ChannelFinding(channel.name, channel.unit, _size(problem.residual), floor, p_value, flagged)
+        finding = ChannelFinding(channel.name, channel.unit, _size(problem, problem.residual), floor, p_value, flagged)
         other = others.get(channel.name)
         proof = (
             _proof(problem, added, floor, rng) if other is None
@@ -217,7 +217,7 @@ def _speaks_against(problem: RegressionProblem, named: NamedTerm) -> bool:
     term = next(term for term in problem.terms if term.effect == named.term.effect)
     values = {name: estimate.value for name, estimate in named.estimates.items()}
     shape = {name: values.get(name, value) for name, value in term.shapes[0].items()}
-    return _size(problem.residual - term.columns(shape)[:, :, 0]) > _size(problem.residual)
+    return _size(problem, problem.residual - term.columns(shape)[:, :, 0]) > _size(problem, problem.residual)
 
 
 def _pooled(named: Sequence[NamedTerm]) -> NamedTerm | None:
@@ -257,8 +257,9 @@ def _first_look(problem: RegressionProblem, settings: SelectionSettings | None) 
     return {problem.terms[candidate.instance.term].effect: candidate.gain for candidate in reversed(candidates)}
 
 
-def _size(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _size(problem: RegressionProblem, values: FloatArray) -> float:
+    """Root mean square of values (T, 1) where they can be judged."""
+    return float(np.sqrt(np.mean(values[problem.valid] ** 2)))
 
 
 def _predicted(fitted: RegressionProblem, problem: RegressionProblem, explanation: Explanation | None) -> FloatArray:
@@ -281,9 +282,10 @@ def _predicted(fitted: RegressionProblem, problem: RegressionProblem, explanatio
 
 
 def _proof(problem: RegressionProblem, added: FloatArray, floor: float, rng: np.random.Generator) -> ChannelProof:
-    spread = max(float(np.std(problem.measured)), 1e-300)
-    squares = [((values / spread) ** 2) for values in (problem.residual, problem.residual - added)]
-    errors = PairedErrors.of(squares[0], squares[1], blocks_of(problem.recording, problem.time), rng)
+    rows = problem.valid[:, 0]
+    spread = max(float(np.std(problem.measured[rows])), 1e-300)
+    squares = [((values[rows] / spread) ** 2) for values in (problem.residual, problem.residual - added)]
+    errors = PairedErrors.of(squares[0], squares[1], blocks_of(problem.recording[rows], problem.time[rows]), rng)
     before, after = (float(np.sqrt(values[0])) for values in (errors.before, errors.after))
     first, last = (interval(np.sqrt(draws[:, 0])) for draws in (errors.before_draws, errors.after_draws))
     return ChannelProof(problem.channels[0].name, floor / spread, before, after, first, last)

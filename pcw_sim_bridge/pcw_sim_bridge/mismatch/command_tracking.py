@@ -39,6 +39,8 @@ from .reported_torques import doubtful_reports
 
 LARGEST_STEP = 1e-3  # [s] of the kernels
 SHORTEST = 1.0  # [s]
+# So many samples after one whose command was lost are not judged either: a drive that lags has not forgotten it yet.
+REMEMBERED = 2
 # Nobody knows how long a command was on its way within its own cycle: this part of a cycle either way.
 LATENCY_PART = 0.1
 PRESENCE = LinearParameter("presence", "1", 0.6, 1.6, 0.5, hidden=True)
@@ -64,6 +66,7 @@ class CommandedJoint:
     Attributes:
         time: [s]; interval: between samples [s].
         command: held at each sample, within the joint's limit; torque: reported [N m]; rate: of the joint [rad/s].
+        known: whether the command, and those just before it, were recorded; else the last one that was stands there.
     """
 
     recording: int
@@ -72,6 +75,7 @@ class CommandedJoint:
     command: FloatArray
     torque: FloatArray
     rate: FloatArray
+    known: BoolArray
 
     @functools.cached_property
     def steps(self) -> tuple[float, IntArray]:
@@ -127,16 +131,31 @@ def commanded_joints(
                 if (i, axis) in doubtful:
                     continue
                 command = commands[:, i, axis]
-                usable = np.isfinite(command) & np.isfinite(joints.effort[:, i, axis])
+                lasting, known = _lasting(joints.stamp, command)
+                usable = np.isfinite(lasting) & np.isfinite(joints.effort[:, i, axis])
                 for piece in _pieces(joints.stamp, np.asarray(usable)):
+                    if not known[piece].any():
+                        continue
                     own = np.nan_to_num(joints.velocity[piece, i, axis])
                     found.setdefault((i, axis), []).append(
                         CommandedJoint(
                             index, float(np.median(np.diff(joints.stamp[piece]))), joints.stamp[piece],
-                            np.ascontiguousarray(command[piece]), joints.effort[piece, i, axis], np.ascontiguousarray(own),
+                            np.ascontiguousarray(lasting[piece]), joints.effort[piece, i, axis], np.ascontiguousarray(own),
+                            known[piece],
                         )
                     )
     return found
+
+
+def _lasting(stamp: FloatArray, command: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return a command (T,) that lasts where the next was lost, NaN over a longer gap, and where it is known (T,)."""
+    told = np.isfinite(command)
+    last = np.maximum.accumulate(np.where(told, np.arange(len(command)), -1))
+    fresh = (last >= 0) & (stamp - stamp[np.maximum(last, 0)] < LARGEST_GAP)
+    known = told.copy()
+    for back in range(1, REMEMBERED + 1):
+        known[back:] &= told[:-back]
+    return np.where(fresh, command[np.maximum(last, 0)], np.nan), known
 
 
 def _pieces(stamp: FloatArray, usable: BoolArray) -> list[slice]:
@@ -189,12 +208,13 @@ class _JointProblem:
         self._known = sorted(known, key=lambda instance: get(instance.name).stage)  # type: ignore[attr-defined]
         self._plain = self._torques(())
         self._measured = np.concatenate([piece.torque for piece in pieces])
+        self._told = np.concatenate([piece.known for piece in pieces])
 
     @property
     def reports_commands(self) -> bool:
         """Whether the reports are nearer to the commands than to what the described effects make of them."""
         asked = np.concatenate([piece.command for piece in self.pieces])
-        left = [float(np.sum((self._measured - torque) ** 2)) for torque in (asked, self._plain)]
+        left = [self._sum_of_squares(self._measured - torque) for torque in (asked, self._plain)]
         return left[0] < NEARER * left[1]
 
     def _torques(self, more: Sequence[EffectInstance]) -> FloatArray:
@@ -221,7 +241,7 @@ class _JointProblem:
             rate=1.0 / self.pieces[0].interval,
             measured=self._measured[:, None],
             residual=(self._measured - self._plain)[:, None],
-            valid=np.ones((len(self._measured), 1), dtype=bool),
+            valid=self._told[:, None],
             nuisances=tuple(self._nuisances()),
             terms=tuple(self._terms(searched)),
             variables=self._variables(),
@@ -274,7 +294,7 @@ class _JointProblem:
             best = TIMES[int(np.argmin(left))]
             times, among = {*TIMES, *self._reaching(0.0, 0.0)}, 0
             near = {*self._reaching(best / TIME_SPACING, best * TIME_SPACING)}
-            if not near <= times and min(left) < WORTH_A_LOOK * float(np.sum((self._measured - self._plain) ** 2)):
+            if not near <= times and min(left) < WORTH_A_LOOK * self._sum_of_squares(self._measured - self._plain):
                 times, among = times | near, len({*TIMES, *self._reaching(0.0, TIMES[-1])})
             return tuple({**defaults, first.name: float(t)} for t in sorted(times)), {first.name: ("log", TIME_SPACING)}, among
         if first.unit != "N m":
@@ -295,7 +315,11 @@ class _JointProblem:
 
     def _left(self, shape: Shape, effect: ActuatorEffect) -> float:
         """Sum of squares that an effect leaves of the reported torque."""
-        return float(np.sum((self._measured - self._plain - self._column(effect, shape)[:, 0, 0]) ** 2))
+        return self._sum_of_squares(self._measured - self._plain - self._column(effect, shape)[:, 0, 0])
+
+    def _sum_of_squares(self, values: FloatArray) -> float:
+        """Of a signal (T,), where the command is known."""
+        return float(np.sum(values[self._told] ** 2))
 
     def _reaching(self, shortest: float, longest: float) -> list[float]:
         """Times [s] that reach a little into the last step of one of the commonest cycles, or of several one after another.

@@ -577,7 +577,7 @@ class EffectSearch(SetGrowth):
         self.outlines[term] = reaching(regression, others, instance, self.outlines[term], DROP)
 
     def exact_problem(self, selection: Selection) -> RegressionProblem:
-        """Return the problem as it is exact at a selection with just the shapes that it has; the search goes on from its own."""
+        """Return the problem as it is exact at a selection with just its shapes; the search goes on from its own."""
         here = self.problem, self._point
         self._be_exact_at(selection)
         problem = self.problem

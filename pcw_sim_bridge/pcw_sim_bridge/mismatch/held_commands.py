@@ -13,6 +13,12 @@ from .regression_problem import BoolArray, FloatArray
 SAME_STAMP = 1e-6  # [s]
 # Where stamps tremble, a command and a state are of the same time that are nearer than this part of the shorter interval.
 SAME_PART = 0.25
+# Where one command is given for each state and both are of the same time on average, of which half a cycle is the farthest: a
+# tremble of both by a quarter of a cycle would otherwise give one state in eight the command after its own, as if drives lagged.
+SAME_ON_AVERAGE, CYCLES_ALIKE, LEAST_UNISON = 0.5, 0.1, 0.2
+# There, a command that is older than usual by this part of a cycle is not the one that was held: that was lost on its way to
+# the recording.
+LOST_PART = 0.5
 LARGEST_GAP = 0.05  # [s]; an older command is not held any more
 SURE = 5.0  # deviations of chance, by which one way to read the stamps must be nearer to what was reported than another
 NOISE_BANDS = 10  # of all frequencies; the quietest holds no more than the noise
@@ -28,9 +34,10 @@ LEAST_DURATION, FOLLOWS = 15.0, (0.8, 1.2)
 
 
 def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray | None:
-    """Return the command held by every joint at each stamp (T, n, 2) [N m], within its limit; NaN where there was none.
+    """Return the command held by every joint at each stamp (T, n, 2) [N m], within its limit; NaN where there is none.
 
-    None where no torques were commanded at all, or none reported.
+    That is before the first, after a pause, and where one was lost on its way to the recording. None where no torques were
+    commanded at all, or none reported.
 
     What is reported at a stamp is the answer to the command before it. But who logs a state together with the torque that was
     computed from it gives both the same stamp: then what is reported is nearer to the command of its own stamp, which no
@@ -44,15 +51,40 @@ def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray |
         return _held(commands.stamp, effort, latest, joints.stamp)
 
     effort = np.clip(commands.effort, -robot.torque_limit, robot.torque_limit)
+    cycle = _common_cycle(commands.stamp, joints.stamp)
     same = SAME_PART * min(float(np.median(np.diff(series.stamp))) for series in (commands, joints))
-    found = held(joints.stamp - SAME_STAMP)
+    if cycle is not None and _are_of_the_same_time(commands.stamp, joints.stamp, cycle):
+        same = SAME_ON_AVERAGE * cycle
+    found, latest = held(joints.stamp - SAME_STAMP), joints.stamp - SAME_STAMP
     for offset in (-same, SAME_STAMP, same):
         instead = held(joints.stamp + offset)
         nearer = (joints.effort - found) ** 2 - (joints.effort - instead) ** 2
-        nearer = nearer[np.isfinite(nearer)]
+        # Roots of squares: else a few leaps of the commands, which any lag leaves far behind, would drown all the rest.
+        nearer = np.sign(nearer[np.isfinite(nearer)]) * np.sqrt(np.abs(nearer[np.isfinite(nearer)]))
         if nearer.sum() > SURE * np.sqrt(np.sum(nearer**2)):
-            found = instead
+            found, latest = instead, joints.stamp + offset
+    if cycle is not None:
+        age = _age(commands.stamp, latest)
+        found[age > np.median(age) + LOST_PART * cycle] = np.nan
     return found
+
+
+def _common_cycle(given: FloatArray, stamp: FloatArray) -> float | None:
+    """Return the cycle [s] in which one command (M,) is given for each state (T,); None where it is not."""
+    cycles = [float(np.median(np.diff(stamps))) for stamps in (given, stamp)]
+    return min(cycles) if max(cycles) < (1.0 + CYCLES_ALIKE) * min(cycles) else None
+
+
+def _are_of_the_same_time(given: FloatArray, stamp: FloatArray, cycle: float) -> bool:
+    """Whether commands (M,) are nearer in time to the states (T,) that they are of than to any other."""
+    together = np.mean(np.exp(2j * np.pi * _age(given, stamp) / cycle))
+    return bool(np.abs(together) > LEAST_UNISON and np.abs(np.angle(together)) <= 2.0 * np.pi * SAME_PART)
+
+
+def _age(given: FloatArray, latest: FloatArray) -> FloatArray:
+    """How long before each time (T,) the last command (M,) was given [s]; before the first one less than nothing."""
+    age: FloatArray = latest - given[np.maximum(np.searchsorted(given, latest, side="left") - 1, 0)]
+    return age
 
 
 def held_speeds(recording: Recording) -> FloatArray:

@@ -1,7 +1,10 @@
-"""Dead times and lags of drives whose reported torques are the commands themselves.
+"""Whether torques come late or their reports do: what the robot's motion says of commands and reported torques.
 
 Many drives report what they were asked for. Between command and report nothing happens then, and what a drive makes of a
 command shows in the motion alone: the torques that move the robot come later than they are reported (`torque_lag`).
+
+Others filter what they report. Between command and report there is a lag then, and the robot moves as if there were none:
+the torques that move it come before they are reported.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ TORQUE_LAG, DEAD_TIME, LAG = "torque_lag", "actuator_delay", "actuator_lag"
 ECHOED = 0.3
 # Cycles by which torques may be late of themselves: a command is made within one and held for another.
 USUAL_CYCLES = 2.0
+# By so much of a cycle torques act before they are reported of themselves, at most: they are held for one.
+HELD_CYCLES = 0.75
 # A dead time and a lag are told apart by what they do to fast torques, of which filtered motions show nothing.
 EVEN = 0.5
 
@@ -63,6 +68,57 @@ def with_late_torques(
     )
 
 
+def without_late_reports(
+    commands: CommandFindings, problems: Sequence[RegressionProblem], explanation: Explanation
+) -> CommandFindings:
+    """Take back what makes all drives late where the robot moves as if they were not: their reports are late.
+
+    Between a report that is as late as it seems and one that is not the nearer one is believed.
+
+    Args:
+        commands: what is found between commands and reports.
+        problems: one per joint with commands and reports.
+        explanation: of the robot's motion.
+    """
+    late, delays = _lateness(explanation), _delays(commands)
+    casters = {caster for channel in explanation.search.problem.channels for caster in channel.casters}
+    if late is None or not problems or set(delays) != {(caster, axis) for caster in casters for axis in AXIS_NAMES}:
+        return commands
+    cycle = max(1.0 / problem.rate for problem in problems)
+    ahead, deviation = -late[0], late[1]
+    usual, delay = HELD_CYCLES * cycle, float(np.mean(list(delays.values())))
+    if delay <= usual or ahead - HALF_WIDTH * deviation < 0.5 * (usual + delay):
+        return commands
+    kept = [k for k, (named, _) in enumerate(commands.named) if named.term.effect not in (DEAD_TIME, LAG)]
+    proofs = commands.proofs
+    if not kept:
+        proofs = tuple(dataclasses.replace(p, after=p.before, after_ci95=p.before_ci95) for p in proofs)
+    note = (
+        f"Reported torques follow the commands {1e3 * delay:.2g} ms late in every joint, and the robot "
+        f"moves by torques {1e3 * ahead:.2g} ms before they are reported: it is the reports that are late, as by a filter, and "
+        "not the drives. Record torques unfiltered to see what drives make of their commands."
+    )
+    return dataclasses.replace(
+        commands,
+        named=tuple(commands.named[k] for k in kept),
+        locations=tuple(commands.locations[k] for k in kept),
+        proofs=proofs,
+        notes=(*commands.notes, note),
+        numbers=(*commands.numbers, TORQUE_LAG),
+    )
+
+
+def _delays(commands: CommandFindings) -> dict[tuple[str, str], float]:
+    """How late reports follow commands by what is named [s], by joint (caster, axis)."""
+    found: dict[tuple[str, str], float] = {}
+    for (named, _), place in zip(commands.named, commands.locations, strict=True):
+        if named.term.effect in (DEAD_TIME, LAG):
+            [delay] = [named.estimates[name].value for name in ("delay", "time_constant") if name in named.estimates]
+            for caster in place.casters:
+                found[caster, place.axis] = found.get((caster, place.axis), 0.0) + delay
+    return found
+
+
 def _lateness(explanation: Explanation) -> tuple[float, float] | None:
     """How much later than reported the torques acted, and its standard deviation [s]; None where no torques are judged."""
     numbers = [number.name for number in explanation.search.problem.nuisances]
@@ -76,7 +132,7 @@ def _are_echoed(problems: Sequence[RegressionProblem], motion: RegressionProblem
     """Whether all joints report their commands."""
     casters = {caster for channel in motion.channels for caster in channel.casters}
     reporting = {(p.channels[0].casters[0], p.channels[0].axis) for p in problems}
-    sizes = [[float(np.sqrt(np.mean(values**2))) for values in (p.residual, p.measured)] for p in problems]
+    sizes = [[float(np.sqrt(np.mean(values[p.valid] ** 2))) for values in (p.residual, p.measured)] for p in problems]
     return (
         bool(problems) and reporting >= {(caster, axis) for caster in casters for axis in AXIS_NAMES}
         and all(departure < ECHOED * size for departure, size in sizes)
