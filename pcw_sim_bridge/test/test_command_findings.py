@@ -214,6 +214,10 @@ def test_stamps_that_tremble_are_no_dead_time(later):
     assert command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None).named == ()
 
 
+def recorded(effects):
+    return simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), effects)
+
+
 def through_a_busy_network(recording, part, lost, seed=2):
     """The recording with stamps that tremble by up to so much of a cycle either way, and with a part of its messages lost."""
     rng = np.random.default_rng(seed)
@@ -235,7 +239,7 @@ def through_a_busy_network(recording, part, lost, seed=2):
 @pytest.mark.parametrize(("part", "lost"), [(0.0, 0.02), (0.25, 0.0), (0.25, 0.03)])
 def test_a_busy_network_is_no_drive_that_lags(part, lost):
     """A command that took the place of the next, or of one that was lost, was a lag of all drives by half a cycle."""
-    recording = through_a_busy_network(simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), ()), part, lost)
+    recording = through_a_busy_network(recorded(()), part, lost)
     held, joints = held_commands(ROBOT, recording), recording.joint_states
     problems = command_problems(ROBOT, [recording])
     assert len(problems) == 2 * ROBOT.n
@@ -252,7 +256,7 @@ def test_a_busy_network_is_no_drive_that_lags(part, lost):
 
 def test_a_drive_that_lags_is_found_through_a_busy_network():
     lag = EffectInstance("actuator_lag", ROBOT.caster_names, {"time_constant": 0.004}, "drive")
-    recording = through_a_busy_network(simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 15.0, 3), [lag]), 0.25, 0.03)
+    recording = through_a_busy_network(recorded([lag]), 0.25, 0.03)
     findings = command_findings(command_problems(ROBOT, [recording]), (), 0, None, lambda message: None)
     [(named, instance)] = findings.named
     assert (named.term.effect, instance.target, instance.axis) == ("actuator_lag", ROBOT.caster_names, "drive")

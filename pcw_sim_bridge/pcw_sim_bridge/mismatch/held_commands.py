@@ -13,8 +13,8 @@ from .regression_problem import BoolArray, FloatArray
 SAME_STAMP = 1e-6  # [s]
 # Where stamps tremble, a command and a state are of the same time that are nearer than this part of the shorter interval.
 SAME_PART = 0.25
-# Where one command is given for each state and both are of the same time on average, of which half a cycle is the farthest: a
-# tremble of both by a quarter of a cycle would otherwise give one state in eight the command after its own, as if drives lagged.
+# Where one command is given for each state and both are of the same time on average, half a cycle is the farthest: if both
+# trembled by a quarter of one, one state in eight would get the command after its own, as if drives lagged.
 SAME_ON_AVERAGE, CYCLES_ALIKE, LEAST_UNISON = 0.5, 0.1, 0.2
 # There, a command that is older than usual by this part of a cycle is not the one that was held: that was lost on its way to
 # the recording.

@@ -94,9 +94,9 @@ def without_late_reports(
     if not kept:
         proofs = tuple(dataclasses.replace(p, after=p.before, after_ci95=p.before_ci95) for p in proofs)
     note = (
-        f"Reported torques follow the commands {1e3 * delay:.2g} ms late in every joint, and the robot "
-        f"moves by torques {1e3 * ahead:.2g} ms before they are reported: it is the reports that are late, as by a filter, and "
-        "not the drives. Record torques unfiltered to see what drives make of their commands."
+        f"Reported torques follow the commands {1e3 * delay:.2g} ms late in every joint, and the robot moves by torques "
+        f"{1e3 * ahead:.2g} ms before they are reported: it is the reports that are late, as by a filter, and not the drives. "
+        "Record torques unfiltered to see what drives make of their commands."
     )
     return dataclasses.replace(
         commands,
