@@ -76,6 +76,12 @@ class Refusal(enum.Enum):
     CANCELLED = "cancelled"
 
 
+# What keeps one caster from being tested, where another one may be.
+OF_ONE_CASTER = frozenset(
+    {Refusal.TOO_SLOW, Refusal.TOO_FAST, Refusal.TORQUE, Refusal.OTHERS_NEAR_LIMIT, Refusal.DISTURBANCE}
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class ActiveParameters:
     """How slip is made, and when it is safe.
@@ -186,6 +192,7 @@ class ActiveState:
         spent: sum of the wrenches so far of the casters under test, for a force of 1 (3,) [1, 1, m].
         backwards: whether the one under test is braked.
         refusal: why it ended early.
+        tested: casters whose test has begun; refused: those that were left out, each with its reason.
     """
 
     phase: Phase
@@ -200,6 +207,8 @@ class ActiveState:
     spent: FloatArray
     backwards: bool
     refusal: Refusal
+    tested: tuple[int, ...] = ()
+    refused: tuple[tuple[int, Refusal], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,6 +296,8 @@ class ActiveIdentification:
     def request(self, state: ActiveState, casters: tuple[int, ...] | None = None) -> ActiveState:
         """Return the state with the test of some casters, all by default, asked for.
 
+        One that cannot be tested as the robot stands and drives is left out, with its reason in `refused`; the others follow.
+
         Raises:
             TerrainError: a caster that the robot does not have.
         """
@@ -294,8 +305,9 @@ class ActiveIdentification:
         if not queue or any(not 0 <= index < self.n for index in queue):
             raise TerrainError(f"casters = {queue!r} is not allowed; allowed: indices 0 to {self.n - 1}, at least one")
         return dataclasses.replace(
-            state, phase=Phase.WAIT, queue=queue, elapsed=0.0, slip=0.0, spent=np.zeros(3), refusal=Refusal.NONE
-        )
+            state, phase=Phase.WAIT, queue=queue, elapsed=0.0, slip=0.0, spent=np.zeros(3), refusal=Refusal.NONE, tested=(),
+            refused=(),
+        )  # fmt: skip
 
     def cancel(self, state: ActiveState) -> ActiveState:
         """Return the state with everything asked for taken back; a wheel that slips returns first."""
@@ -370,6 +382,12 @@ class ActiveIdentification:
 
     def _begin(self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> ActiveState:
         refusal = state.refusal if state.refusal is Refusal.CANCELLED else self._unsafe(state.queue[0], m, A, twist)
+        if refusal in OF_ONE_CASTER:
+            refused = (*state.refused, (state.queue[0], refusal))
+            if len(state.queue) > 1:
+                return dataclasses.replace(state, queue=state.queue[1:], refused=refused)
+            phase = Phase.DONE if state.tested else Phase.REFUSED
+            return dataclasses.replace(state, phase=phase, queue=(), elapsed=0.0, refusal=refusal, refused=refused)
         if refusal is not Refusal.NONE:
             return dataclasses.replace(state, phase=Phase.REFUSED, queue=(), elapsed=0.0, refusal=refusal)
         # Driven or braked: whichever makes up for what those before have left, turning first.
@@ -388,6 +406,7 @@ class ActiveIdentification:
             creep_sums=np.zeros(3),
             backwards=backwards,
             spent=spent,
+            tested=(*state.tested, state.queue[0]),
         )
 
     def _unsafe(self, caster: int, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> Refusal:

@@ -28,8 +28,12 @@ sum w z r is sum over k and l of w_k z_k w_l z_l C(k, l), and so on. What residu
 correlation that they have.
 
 An estimate is valid when it is narrow enough, the slip has been beyond `least_slip` of the largest lambda_p that it allows,
-and the force acted along the slip and not against it. Residuals that add up to a jump mean that the ground changed: the
-estimate then begins anew from the blocks since.
+and the force acted along the slip and not against it. One slip that is held gives one equation for two numbers, and the second
+one has a root wherever a = 0, at lambda_p = slip: what of a is not z has to be more than noise makes of it.
+
+Residuals that add up to a jump mean that the ground changed: the estimate then begins anew from the blocks since. So does a
+force that no ground of that mu_p holds, where a wheel grips and its slip is not known; and where nothing is felt for `reach`,
+the estimate is kept, but is not vouched for.
 """
 
 from __future__ import annotations
@@ -89,6 +93,9 @@ CHANGE_FLOOR = 0.05
 YOUNG_BLOCKS = 30.0
 # How large a jump is, is told by so many of the newest residuals.
 JUMP_BLOCKS = 3
+# No ground holds more than its peak: so many blocks more above it than not, by this part of it and by so many standard
+# deviations, are of another ground, whatever the slip.
+ABOVE_PART, ABOVE_DEVIATIONS, ABOVE_BLOCKS = 0.1, 3.0, 5.0
 # Forces against the slip by this many standard deviations, in this many blocks more than along it, have the wrong sign.
 WRONG_SIGN_DEVIATIONS, WRONG_SIGN_BLOCKS = 3.0, 8.0
 # Residuals of this many expected standard deviations say that the curve is another one.
@@ -101,14 +108,17 @@ STAYS_VALID = 1.25
 COMPARABLE = (0.2, 0.5)
 # So many blocks must have slipped beyond `least_slip`: fewer of gentle slip may be noise.
 BEYOND_BLOCKS = 5.0
+# Two numbers take two slips: what of one instrument is not the other has to be so many times what a slip that is always the
+# same makes of it, by its noise and by this part of itself.
+VARIED, VARIED_CHANCE, STEADY_PART = 1.4, 3.0, 0.05
 # A curve must fit better than a straight line by so much (twice the logarithm of the likelihood).
 BENT = 20.0
 
 # Layout of the parameters as the kernels take them.
 (
     _CUT_OFF, _RELAXATION, _INERTIA, _LATERAL_MU, _LATERAL_LAMBDA, _SLIP_ACCURACY, _FRICTION_ACCURACY, _MEMORY, _LEAST_SPEED,
-    _LEAST_LOAD, _LEAST_SLIP, _SLIP_SPREAD, _FRICTION_SPREAD, _LEAST_BLOCKS,
-) = range(14)  # fmt: skip
+    _LEAST_LOAD, _LEAST_SLIP, _SLIP_SPREAD, _FRICTION_SPREAD, _LEAST_BLOCKS, _REACH,
+) = range(15)  # fmt: skip
 # Layout of the state: two stages of each filtered signal, then the rest.
 _ROLLING, _VELOCITY, _FORCE, _SLIP_Y, _FORCE_Y, _LOAD = range(0, 12, 2)
 _BEFORE, _NOISE = 12, 21  # two readings before of rolling speed, velocity and force; their variances
@@ -124,8 +134,9 @@ _HISTORY, _BLOCK = 16, 15  # blocks kept: slip, variance, friction, variance, ti
 # tyre's relaxation (0: none), noise of the friction by the wheel's acceleration and by the force, sign of the force
 _KNOWN_FOR, _MISFITS = 62, 63  # time for which every reading has been known [s]; blocks in a row of which none fits
 _TAKEN = 64  # blocks taken so far, modulo PAIRS; then time and sign of each of the last ones
-_STATE = _TAKEN + 1 + 2 * PAIRS
-_PAIRED = 17  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
+_WAY, _ABOVE = _TAKEN + 1 + 2 * PAIRS, _TAKEN + 2 + 2 * PAIRS  # rolled since a block said something [m]; see ABOVE_BLOCKS
+_STATE = _ABOVE + 1
+_PAIRED = 20  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
 _SUMS = _PAIRED + 4 * PAIRS
 # Columns of what `TerrainEstimator.run` returns.
 RESULTS = 14
@@ -133,14 +144,15 @@ MU_P, LAMBDA_P, MU_VARIANCE, COVARIANCE, LAMBDA_VARIANCE, IS_VALID, MISFIT, REAS
 FRICTION, SLIP_NOISE, SINCE_CHANGE, SUSPECT = range(10, RESULTS)
 (
     _ZZ, _ZA, _AA, _ZY, _ZG, _AY, _AG, _YY, _GY, _GG, _LOG, _BEYOND, _W, _NOISE_ZZ, _NOISE_ZA, _NOISE_AA, _NOISE_SHARE,
+    _STEADY_ZZ, _STEADY_ZA, _STEADY_AA,
 ) = range(_PAIRED)  # fmt: skip
 
 # Why an estimate is not valid, or 0.
-VALID, TOO_FEW, TOO_LITTLE_SLIP, TOO_WIDE, WRONG_SIGN, NO_FIT, AT_A_BOUND = range(7)
+VALID, TOO_FEW, TOO_LITTLE_SLIP, TOO_WIDE, WRONG_SIGN, NO_FIT, AT_A_BOUND, TOO_FAR = range(8)
 REASONS = (
     "valid", "too few readings at speed", "not enough slip to know", "not certain enough yet",
     "forces act against the slip: a torque or a speed has the wrong sign", "the friction curve does not fit",
-    "at a bound of what is possible",
+    "at a bound of what is possible", "nothing felt of the ground for too long a way",
 )  # fmt: skip
 
 
@@ -161,6 +173,7 @@ class TerrainParameters:
         least_slip: part of the critical slip that must have been reached [1].
         slip_spread, friction_spread: standard deviations of the logarithms up to which an estimate is valid [1].
         least_blocks: blocks (50 a second) that an estimate takes at least.
+        reach: way rolled without a reading that says something, after which an estimate is not vouched for any more [m].
     """
 
     contact: ContactDescription | None = None
@@ -175,6 +188,7 @@ class TerrainParameters:
     slip_spread: float = 0.12
     friction_spread: float = 0.06
     least_blocks: int = 10
+    reach: float = 5.0
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -188,6 +202,7 @@ class TerrainParameters:
         for name in ("slip_accuracy", "friction_accuracy"):
             require(name, getattr(self, name), minimum=0.0, maximum=0.5)
         require("memory", self.memory, above=0.0)
+        require("reach", self.reach, above=0.0)
         require("least_speed", self.least_speed, above=0.0)
         require("least_slip", self.least_slip, minimum=0.5, maximum=1.0)
         for name in ("slip_spread", "friction_spread"):
@@ -205,7 +220,7 @@ class TerrainParameters:
             [
                 self.cut_off, relaxation, self.inertia, lateral_mu, lateral_lambda, self.slip_accuracy,
                 self.friction_accuracy, self.memory, self.least_speed, self.least_load, self.least_slip, self.slip_spread,
-                self.friction_spread, self.least_blocks,
+                self.friction_spread, self.least_blocks, self.reach,
             ]
         )  # fmt: skip
 
@@ -400,6 +415,12 @@ def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged
         sums[j, _ZZ] += w * z * z
         sums[j, _ZA] += w * z * a
         sums[j, _AA] += w * a * a
+        # What noise, and a slip that is hardly another one, make of both where the slip is always the same.
+        tremble = 0.5 * of_slip[0] * per_square + (STEADY_PART * x_lag) ** 2
+        bent_a = -slope - x_lag * bend_lag
+        sums[j, _STEADY_ZZ] += w * slope * slope * tremble
+        sums[j, _STEADY_ZA] += w * slope * bent_a * tremble
+        sums[j, _STEADY_AA] += w * bent_a * bent_a * tremble
         sums[j, _ZY] += w * z * friction
         sums[j, _ZG] += w * (z * corrected - slope * slope_now * shared * per_square)
         sums[j, _AY] += w * a * friction
@@ -441,6 +462,16 @@ def _equation(sums, j):  # type: ignore[no-untyped-def]
     """Return mu_p and the second equation's left side at a lambda_p of the grid."""
     mu = sums[j, _ZY] / max(sums[j, _ZG], 1e-300)
     return mu, sums[j, _AY] - mu * sums[j, _AG]
+
+
+@compiled
+def _varied(sums, j, allowed):  # type: ignore[no-untyped-def]
+    """Return whether slips are varied enough to tell a lambda_p of the grid from mu_p; `allowed`: see `STAYS_VALID`."""
+    share = sums[j, _ZA] / max(sums[j, _ZZ], 1e-300)
+    apart = sums[j, _AA] - share * sums[j, _ZA]
+    by_noise = sums[j, _STEADY_AA] - 2.0 * share * sums[j, _STEADY_ZA] + share * share * sums[j, _STEADY_ZZ]
+    by_chance = VARIED_CHANCE * math.sqrt(2.0 / max(sums[j, _W], 1.0))
+    return apart * allowed * allowed > (VARIED + by_chance) * by_noise
 
 
 @compiled
@@ -524,7 +555,7 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
         result[7] = WRONG_SIGN
     elif where >= GRID or sums[where, _BEYOND] < BEYOND_BLOCKS or straight - least < BENT * scale:
         result[7] = TOO_LITTLE_SLIP
-    elif state[_SLIP_NOISE] > GREATEST_NOISE * critical:
+    elif state[_SLIP_NOISE] > GREATEST_NOISE * critical or not _varied(sums, j, allowed):
         result[7] = TOO_LITTLE_SLIP
     elif not (LEAST_FRICTION < mu < GREATEST_FRICTION):
         result[7] = AT_A_BOUND
@@ -539,10 +570,40 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
 @compiled
 def _forget(state, sums):  # type: ignore[no-untyped-def]
     sums[:] = 0.0
-    for index in (_WEIGHT, _BLOCKS, _CORRELATION, _LAST_RESIDUAL, _UP, _DOWN, _SUSPECT, _WRONG_SIGN):
+    for index in (_WEIGHT, _BLOCKS, _CORRELATION, _LAST_RESIDUAL, _UP, _DOWN, _SUSPECT, _WRONG_SIGN, _ABOVE):
         state[index] = 0.0
     state[_RESULT : _RESULT + 8] = 0.0
     state[_RESULT + 7] = TOO_FEW
+
+
+@compiled
+def _begin_anew(state, sums, history):  # type: ignore[no-untyped-def]
+    """Give up what has been learned of a ground that is another one now."""
+    _forget(state, sums)
+    state[_CHANGES] += 1.0
+    state[_CHANGE_TIME], state[_OPENED] = state[_TIME], 0.0
+    history[:, 5] = 0.0
+
+
+@compiled
+def _friction_noise(numbers, state, full_gain, load):  # type: ignore[no-untyped-def]
+    """Return the noise of a block's friction by the wheel's acceleration and by the force, each per unit of its share."""
+    per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
+    return full_gain * per_time * per_time * state[_NOISE] / (load * load), full_gain * state[_NOISE + 2] / (load * load)
+
+
+@compiled
+def _holds_too_much(numbers, state, full_gain, friction, load):  # type: ignore[no-untyped-def]
+    """Whether a wheel has held more than the ground that it is said to stand on can hold, for long enough."""
+    result = state[_RESULT : _RESULT + 8]
+    if result[5] == 0.0:
+        state[_ABOVE] = 0.0
+        return False
+    ends_unit, force_unit = _friction_noise(numbers, state, full_gain, load)
+    noise = ABOVE_DEVIATIONS * math.sqrt(ends_unit * ends_share(0.0) + force_unit)
+    most = result[0] * math.exp(ABOVE_DEVIATIONS * math.sqrt(result[2])) * (1.0 + ABOVE_PART)
+    state[_ABOVE] = max(state[_ABOVE] + (1.0 if friction > most + noise else -1.0), 0.0)
+    return state[_ABOVE] >= ABOVE_BLOCKS
 
 
 @compiled
@@ -649,9 +710,16 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     full_gain = noise_gain(pole, dt)
     settled, slip_now = state[_NOISE_TIME] > NOISE_SETTLED, mean[5]
     usable = settled and abs(slip_now) <= 1.0 and speed > numbers[_LEAST_SPEED] and load > numbers[_LEAST_LOAD] and force > 0.0
-    usable = usable and state[_KNOWN_FOR] >= KNOWN_BLOCKS * BLOCK_TIME_CONSTANTS / pole
+    known = state[_KNOWN_FOR] >= KNOWN_BLOCKS * BLOCK_TIME_CONSTANTS / pole
+    # Where the slip is known a change shows sooner, see `_watch`.
+    if usable and not known and _holds_too_much(numbers, state, full_gain, force / load, load):
+        _begin_anew(state, sums, history)
+    usable = usable and known
+    state[_WAY] = 0.0 if usable else state[_WAY] + speed * state[_BLOCK_TIME]
     if not usable:
         state[_SLIP], state[_FRICTION], state[_SLIP_NOISE] = 0.0, 0.0, 0.0
+        if state[_RESULT + 5] > 0.0 and state[_WAY] > numbers[_REACH]:
+            state[_RESULT + 5], state[_RESULT + 7] = 0.0, TOO_FAR
         return
     slip_y = mean[6] * numbers[_LATERAL_LAMBDA]
     # Along the force, forwards or backwards: the size alone would turn noise into friction.
@@ -674,9 +742,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     block_shares(pole, math.inf, state[_BLOCK_TIME], force_shares)
     slip_variance, together = noise * slip_shares[0] + 1e-10, noise * slip_shares[1]
     friction = sign * force / load
-    per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
-    ends_unit = full_gain * per_time * per_time * state[_NOISE] / (load * load)
-    force_unit = full_gain * state[_NOISE + 2] / (load * load)
+    ends_unit, force_unit = _friction_noise(numbers, state, full_gain, load)
     friction_variance = ends_unit * ends_share(0.0) + force_unit * force_shares[0]
     accuracy = max(numbers[_FRICTION_ACCURACY], 0.002) * friction
     friction_variance += accuracy * accuracy + 1e-10
@@ -729,7 +795,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
 def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[no-untyped-def]
     """Take one reading (6,) in place: rolling speed, velocity, force, normal force, lateral slip, lateral force.
 
-    A normal force below zero is one of that size in a reading that says nothing.
+    A normal force below zero is one of that size in a reading whose slip is not known.
     """
     pole = POLE_PER_CUT_OFF * numbers[_CUT_OFF]
     share = 1.0 - math.exp(-pole * dt)

@@ -182,7 +182,7 @@ def test_the_controller_sees_wheels_that_roll():
         ({"speed": 0.02}, Refusal.TOO_SLOW),
         ({"speed": 2.0}, Refusal.TOO_FAST),
         ({"mu_p": np.full(4, 1.5)}, Refusal.TORQUE),
-        ({"mu_p": np.array([0.5, 0.1, 0.5, 0.5])}, Refusal.OTHERS_NEAR_LIMIT),
+        ({"mu_p": np.array([0.5, 0.1, 0.5, 0.5]), "casters": (0, 2, 3)}, Refusal.OTHERS_NEAR_LIMIT),  # by caster 1
         ({"turning": True}, Refusal.TURNING),
         ({"soft": True}, Refusal.DISTURBANCE),
     ],
@@ -190,6 +190,7 @@ def test_the_controller_sees_wheels_that_roll():
 def test_it_does_not_begin_where_it_is_not_safe(changes, refusal):
     changes = dict(changes)
     turning, soft = changes.pop("turning", False), changes.pop("soft", False)
+    casters = changes.pop("casters", tuple(range(THESIS.n)))
     measured = steady(THESIS, **changes)
     if turning:
         velocity = measured.velocity.copy()
@@ -197,11 +198,30 @@ def test_it_does_not_begin_where_it_is_not_safe(changes, refusal):
         measured = dataclasses.replace(measured, velocity=velocity)
     # Without pose feedback nothing takes a force away that is not compensated.
     active = ActiveIdentification(THESIS, ActiveParameters(stiffness=10.0) if soft else None)
-    state = active.request(active.initial_state())
+    state = active.request(active.initial_state(), casters)
     for _ in range(100):
         state, output = active.step(state, measured, 0.002)
         assert not output.torque.any()
-    assert state.phase is Phase.REFUSED and state.refusal is refusal
+    assert state.phase is Phase.REFUSED and state.refusal is refusal and state.tested == ()
+    # What is so of one caster says nothing of the next; a robot that turns is no matter of one.
+    assert state.refused == (() if turning else tuple((index, refusal) for index in casters))
+
+
+def test_a_caster_that_cannot_be_tested_is_left_out_and_told():
+    """Where the motor of one had not the torque, none of those after it was tested, and nobody was told which it was."""
+    measured = steady(THESIS, mu_p=np.array([0.5, 1.5, 0.5, 0.5]))
+    active = ActiveIdentification(THESIS, ActiveParameters(others_use=1.0))
+    state, begun = active.request(active.initial_state(), (1, 0)), []
+    for _ in range(100):
+        state, output = active.step(state, measured, 0.002)
+        begun.append(output.testing)
+    assert 0 in begun and 1 not in begun
+    assert state.tested == (0,) and state.refused == ((1, Refusal.TORQUE),)
+    last = active.request(active.initial_state(), (0, 1))
+    last = dataclasses.replace(last, queue=(1,), tested=(0,), elapsed=1.0)
+    last, _ = active.step(last, measured, 0.002)
+    assert last.phase is Phase.DONE and last.refused == ((1, Refusal.TORQUE),)
+    assert active.request(last).refused == ()
 
 
 def test_it_ends_at_once_when_another_wheel_slips_when_cancelled_and_when_it_takes_too_long():
