@@ -57,6 +57,36 @@ def test_a_torque_that_changes_its_sign_with_every_sample_is_found_by_the_speeds
     assert np.median(by_angles.speed[middle]) < 0.1 * np.median(found.speed[middle])
 
 
+def test_a_joint_that_shakes_with_every_sample_is_read_at_a_speed_that_it_does_not_have():
+    """A loop that swung at its own 300 Hz left angles still, speeds of 1.6 rad/s and torques of 4 N m."""
+    position, torque = rolling()
+    velocity = np.gradient(position, 1.0 / RATE, axis=0)
+    velocity[:, 1, 1] = 1.6
+    position[:, 1, 1] = 0.3
+    torque[:, 1, 1] -= 4.0
+    found = wheel_shaking(ROBOT, position, velocity, torque, LOW_PASS)
+    middle = slice(SAMPLES // 4, -SAMPLES // 4)
+    reach = float(np.linalg.norm(ROBOT.caster_offset[1]))
+    np.testing.assert_allclose(found.speed[middle], 1.6 * reach, rtol=0.02)
+    assert found.frequency == RATE
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda rate: np.zeros_like(rate),  # a field that nobody fills
+        lambda rate: 20.0 * rate,  # of the motor before its gear
+        lambda rate: np.apply_along_axis(lambda v: np.convolve(v, np.ones(15) / 15.0)[: len(v)], 0, rate),  # a drive's filter
+        lambda rate: rate + 0.1 * np.random.default_rng(4).standard_normal(rate.shape),
+    ],
+)
+def test_speeds_that_lag_or_are_in_other_units_are_no_shaking(read):
+    position, torque = rolling()
+    velocity = read(np.gradient(position, 1.0 / RATE, axis=0))
+    found = wheel_shaking(ROBOT, position, velocity, torque, LOW_PASS)
+    assert found.speed[SAMPLES // 8 : -SAMPLES // 8].max() < 2e-3
+
+
 def test_noise_of_one_sensor_is_no_shaking():
     """Coarse encoders alone, noisy speeds and noisy torques alone, each large enough to pass for 0.1 m/s."""
     position, torque = rolling()

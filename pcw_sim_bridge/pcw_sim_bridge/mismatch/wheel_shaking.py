@@ -6,6 +6,9 @@ torque in the torques; what shakes a wheel is in both. So the speed is taken tha
 that the torques give the rotors and wheels by themselves, whichever is less. A torque that changes its sign with every sample
 brings the wheel back to where it was: its angles hardly show that, its speeds do.
 
+One that shakes once with every sample, or several times, is always read at the same place of its swing: at a speed with which
+its angle does not move, and with a torque that has as little to do with the mean one.
+
 Casters that roll freely swing about their steering axes by themselves, too, as those of a trolley do (shimmy). No torque is in
 that, and it brings a robot to a stop. Angles alone say so, where they swing by far more than the noise of their encoders.
 """
@@ -15,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy import signal
+from scipy import ndimage, signal
 
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 
@@ -26,6 +29,10 @@ SPECTRUM_SAMPLES = 512
 # Angles alone are believed up to so many times the frequency that is filtered away, and where they swing by a power that is so
 # many times that of their noise.
 BELIEVED, BEYOND_NOISE = 4.0, 9.0
+# A joint is read in step with how it shakes where its speed, averaged over this time [s], is so many times that of its angle
+# and more than chance makes of its noise, by so many standard deviations. That has to be this part of the squares of all that is
+# read: what a filter that lags reads where a joint turns back is not.
+STANDING_TIME, STANDING, BEYOND_CHANCE, STANDING_PART = 1.0, 2.0, 5.0, 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +76,35 @@ def wheel_shaking(
     # From sample to sample: a central difference sees nothing of what changes its sign with every sample.
     by_angle = fast(np.diff(position, axis=0, prepend=position[:1]) * rate)
     by_speed = fast(velocity) if np.isfinite(velocity).all() else by_angle
+    in_step = np.zeros_like(position)
+    if np.isfinite(velocity).all():
+        in_step = reach * _in_step(velocity, position, low_pass)
     by_torque = fast(np.cumsum(fast(torque), axis=0) / (rate * np.maximum(inertia, 1e-9)))
     angle, own, given = (np.maximum(low_pass.smooth(values**2), 0.0) for values in (by_angle, by_speed, by_torque))
     contact = reach * np.sqrt(2.0 * np.minimum(np.maximum(angle, own), given))
+    if np.mean(in_step**2) > np.mean(contact**2):
+        return Shaking(np.hypot(in_step[:, :, DRIVE], in_step[:, :, STEER]).max(axis=1), rate, swing)
     speed = np.hypot(contact[:, :, DRIVE], contact[:, :, STEER]).max(axis=1)
     worst = int(np.argmax(np.mean(contact**2, axis=0)))
     seen = (by_speed if np.sum(own) > np.sum(angle) else by_angle).reshape(count, -1)[:, worst]
     frequencies, density = signal.welch(seen, rate, nperseg=min(SPECTRUM_SAMPLES, count))
     return Shaking(speed, float(frequencies[int(np.argmax(density))]), swing)
+
+
+def _in_step(velocity: FloatArray, position: FloatArray, low_pass: SignalFilter) -> FloatArray:
+    """Speeds (T, n, 2) at which joints are read on average and their angles do not move; zero of a joint that is read rightly.
+
+    Speeds that are always the same times those of the angles, as of a motor before its gear, are only in other units.
+    """
+    rate, count = low_pass.rate, max(round(STANDING_TIME * low_pass.rate), 2)
+    read = ndimage.uniform_filter1d(velocity, count, axis=0)
+    moves = ndimage.uniform_filter1d(np.diff(position, axis=0, prepend=position[:1]) * rate, count, axis=0)
+    units = np.sum(read * moves, axis=0) / np.maximum(np.sum(moves**2, axis=0), 1e-300)
+    noise = BEYOND_CHANCE * np.std(velocity - low_pass.smooth(velocity), axis=0) / np.sqrt(count)
+    beyond = np.minimum(np.abs(read) - STANDING * np.abs(moves), np.abs(read - units * moves)) - noise
+    found = np.maximum(beyond, 0.0)
+    most = np.sum(found**2, axis=0) >= STANDING_PART * np.sum(read**2, axis=0)
+    return np.where(most, found, 0.0)
 
 
 def _swing(angle: FloatArray, low_pass: SignalFilter) -> FloatArray:
