@@ -29,9 +29,9 @@ SPECTRUM_SAMPLES = 512
 # Angles alone are believed up to so many times the frequency that is filtered away, and where they swing by a power that is so
 # many times that of their noise.
 BELIEVED, BEYOND_NOISE = 4.0, 9.0
-# A joint is read in step with how it shakes where its speed, averaged over this time [s], is so many times its angle's
-# and more than chance makes of its noise, by so many standard deviations. That has to be this part of the squares of all that is
-# read: what a filter that lags reads where a joint turns back is not.
+# A joint is read in step with how it shakes where its speed, averaged over this time [s], is so many times that of its angle
+# and more than its noise makes by chance, by so many standard deviations. That has to be this part of the squares of all that
+# is read: what a filter that lags reads where a joint turns back is not.
 STANDING_TIME, STANDING, BEYOND_CHANCE, STANDING_PART = 1.0, 2.0, 5.0, 0.25
 
 
