@@ -7,7 +7,8 @@ Least squares on (5.14) [Li2009] are biased, as the regressor itself is noisy (s
 - all signals pass the same filter, two poles, and so does the derivative of the wheel's speed that (3.45) needs;
 - the slip is relaxed over the tyre's relaxation length like the force is;
 - the filtered signals are sampled so far apart that their noise is nearly independent, as blocks;
-- the noise of speeds and torques is measured from their second differences, and with it the filtered slip's, s, in lambda_p.
+- the noise of speeds and torques is measured from second differences, of speeds from those of means over a part of the
+  filter's memory, and with it the filtered slip's, s, in lambda_p.
   It bends the curve's mean by g'' s^2 / 2, which is taken off:    g_c = g(x) - g''(x) s^2 / 2;
   The curve's mean is bent as well by slip that moves within the filter's memory, which is put back; what noise alone makes
   it move is less than two blocks' noise, since filter and tyre carry noise from one to the next;
@@ -70,8 +71,9 @@ QUIET_NOISE = 0.05
 CORRELATION_SHARE = 0.005
 # Readings have to be known for a block and so many more before it, as the filter remembers what came before.
 KNOWN_BLOCKS = 1.5
-# Noise is averaged over this time [s], and blocks count from when so much of it has passed.
-NOISE_MEMORY, NOISE_SETTLED = 0.5, 0.1
+# Noise is averaged over this time [s], and blocks count from when so much of it has passed; that of speeds is taken from means
+# over the last of these.
+NOISE_MEMORY, NOISE_SETTLED, NOISE_TIME = 0.5, 0.1, 0.004
 # Above this part of the critical slip its noise bends the curve's mean in ways that are not corrected for: a lambda_p as small
 # as the noise is none that was seen.
 GREATEST_NOISE = 0.35
@@ -135,7 +137,8 @@ _HISTORY, _BLOCK = 16, 15  # blocks kept: slip, variance, friction, variance, ti
 _KNOWN_FOR, _MISFITS = 62, 63  # time for which every reading has been known [s]; blocks in a row of which none fits
 _TAKEN = 64  # blocks taken so far, modulo PAIRS; then time and sign of each of the last ones
 _WAY, _ABOVE = _TAKEN + 1 + 2 * PAIRS, _TAKEN + 2 + 2 * PAIRS  # rolled since a block said something [m]; see ABOVE_BLOCKS
-_STATE = _ABOVE + 1
+_AVERAGE, _AVERAGED, _AVERAGES = _ABOVE + 1, _ABOVE + 3, _ABOVE + 4
+_STATE = _AVERAGES + 1
 _PAIRED = 20  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
 _SUMS = _PAIRED + 4 * PAIRS
 # Columns of what `TerrainEstimator.run` returns.
@@ -792,6 +795,18 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
 
 
 @compiled
+def _note_noise(state, k, now, count, dt, before_it):  # type: ignore[no-untyped-def]
+    """Take the mean of `count` readings of a signal, after `before_it` other such means, into the noise of one reading."""
+    before, latest = state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1]
+    if before_it >= 2.0:
+        # The second difference of white noise has six times its variance; a smooth signal has next to none.
+        square = count * (now - 2.0 * latest + before) ** 2 / 6.0
+        forgotten = 1.0 - math.exp(-count * dt / NOISE_MEMORY)
+        state[_NOISE + k] += max(forgotten, 1.0 / (before_it - 1.0)) * (square - state[_NOISE + k])
+    state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1] = latest, now
+
+
+@compiled
 def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[no-untyped-def]
     """Take one reading (6,) in place: rolling speed, velocity, force, normal force, lateral slip, lateral force.
 
@@ -810,14 +825,19 @@ def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[
             state[index], state[index + 1] = value, value
         else:
             _smooth(state, index, value, share)
-    forgotten = 1.0 - math.exp(-dt / NOISE_MEMORY)
-    for k in range(3):
-        before, latest = state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1]
-        if state[_READINGS] >= 2.0:
-            # The second difference of white noise has six times its variance; a smooth signal has next to none.
-            square = (reading[k] - 2.0 * latest + before) ** 2 / 6.0
-            state[_NOISE + k] += max(forgotten, 1.0 / (state[_READINGS] - 1.0)) * (square - state[_NOISE + k])
-        state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1] = latest, reading[k]
+    # Of speeds it is that of their means over a time that the filter lets pass: the noise of differences of encoder counts is
+    # small there, and noise that lasts is not. Forces have ripples faster than that, which the filter takes away.
+    state[_AVERAGED] += 1.0
+    whole = state[_AVERAGED] * dt >= NOISE_TIME - 0.5 * dt
+    for k in range(2):
+        state[_AVERAGE + k] += reading[k]
+        if whole:
+            _note_noise(state, k, state[_AVERAGE + k] / state[_AVERAGED], state[_AVERAGED], dt, state[_AVERAGES])
+            state[_AVERAGE + k] = 0.0
+    if whole:
+        state[_AVERAGED] = 0.0
+        state[_AVERAGES] += 1.0
+    _note_noise(state, 2, reading[2], 1.0, dt, state[_READINGS])
     state[_READINGS] += 1.0
     state[_TIME] += dt
     state[_KNOWN_FOR] = state[_KNOWN_FOR] + dt if reading[3] > 0.0 else 0.0

@@ -161,6 +161,41 @@ def test_intervals_are_as_wide_as_the_errors(case):
 # --- Honesty ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("noise", ["encoder", "lasting"])
+def test_noise_that_is_not_white_is_measured_where_the_filter_lets_it_pass(noise):
+    """Of encoder counts that are differenced, neighbours take back what each other gained; of a bump, they have it, too.
+
+    As white noise the first was three times too large (intervals held in six of ten), and the second a sixth of itself: of 60
+    such runs 3 came to an estimate that was vouched for.
+    """
+    errors, held, valid = [], [], 0
+    for seed in range(30):
+        wheel, run = swept_run(seed, (1.0, 2.0))
+        rng, readings = np.random.default_rng([seed, 62]), readings_of(wheel, run)
+        if noise == "encoder":
+            step = wheel.radius * math.tau / 4096
+            rolled = np.cumsum(run.rolling_speed) / RATE + rng.uniform(0.0, step)
+            readings[1:, 0] = np.diff(np.floor(rolled / step)) * step * RATE
+            readings[0, 0] = readings[1, 0]
+        else:
+            kept = math.exp(-1.0 / (0.005 * RATE))
+            for column, speed in ((0, run.rolling_speed), (1, run.velocity)):
+                lasting = lfilter([math.sqrt(1.0 - kept * kept)], [1.0, -kept], rng.standard_normal(len(speed)))
+                readings[:, column] = speed * (1.0 + 0.03 * lasting)
+        last = estimator_of(wheel).run(readings, 1.0 / RATE, 10)[-1]
+        if np.abs(run.slip_ratio).max() < wheel.contact.lambda_p:
+            continue
+        valid += bool(last[IS_VALID])
+        ground_of = wheel.contact
+        for value, variance, truth in ((MU_P, MU_VARIANCE, ground_of.mu_p), (LAMBDA_P, LAMBDA_VARIANCE, ground_of.lambda_p)):
+            error = abs(math.log(last[value] / truth))
+            errors.append(error / (1.0 if value == LAMBDA_P else 0.4))
+            held.append(error <= 1.96 * math.sqrt(last[variance]))
+    assert valid >= 0.9 * len(errors) / 2
+    assert np.median(errors) < 0.02
+    assert np.mean(held) > 0.7
+
+
 @pytest.mark.parametrize("make", [swept_run, held_run])
 def test_below_half_of_the_critical_slip_nothing_is_called_valid(make):
     """The bar is 1 % of runs, so that one of 25 runs may be."""
