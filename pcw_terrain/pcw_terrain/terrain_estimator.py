@@ -123,7 +123,7 @@ BENT = 20.0
 ) = range(15)  # fmt: skip
 # Layout of the state: two stages of each filtered signal, then the rest.
 _ROLLING, _VELOCITY, _FORCE, _SLIP_Y, _FORCE_Y, _LOAD = range(0, 12, 2)
-_BEFORE, _NOISE = 12, 21  # two readings before of rolling speed, velocity and force; their variances
+_BEFORE, _NOISE = 12, 21  # the two last means of rolling speed and velocity, the two last forces; variances of a reading
 _Z_X, _Z_Y, _TIME, _SINCE_BLOCK, _NOISE_TIME, _READINGS = range(24, 30)
 _WEIGHT, _BLOCKS, _CORRELATION, _LAST_RESIDUAL, _UP, _DOWN, _SUSPECT, _WRONG_SIGN = range(30, 38)
 _CHANGES, _CHANGE_TIME, _SLIP, _FRICTION, _SLIP_NOISE, _OPENED, _CUMULATED = range(38, 45)
@@ -137,7 +137,7 @@ _HISTORY, _BLOCK = 16, 15  # blocks kept: slip, variance, friction, variance, ti
 _KNOWN_FOR, _MISFITS = 62, 63  # time for which every reading has been known [s]; blocks in a row of which none fits
 _TAKEN = 64  # blocks taken so far, modulo PAIRS; then time and sign of each of the last ones
 _WAY, _ABOVE = _TAKEN + 1 + 2 * PAIRS, _TAKEN + 2 + 2 * PAIRS  # rolled since a block said something [m]; see ABOVE_BLOCKS
-_AVERAGE, _AVERAGED, _AVERAGES = _ABOVE + 1, _ABOVE + 3, _ABOVE + 4
+_AVERAGE, _AVERAGED, _AVERAGES = _ABOVE + 1, _ABOVE + 3, _ABOVE + 4  # sums of speeds for such a mean, how many, means so far
 _STATE = _AVERAGES + 1
 _PAIRED = 20  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
 _SUMS = _PAIRED + 4 * PAIRS
