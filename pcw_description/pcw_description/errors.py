@@ -58,9 +58,9 @@ class NumberChecks:
         """Check a number.
 
         Raises:
-            PcwError: as `error`; it is not finite or out of range.
+            PcwError: as `error`; it is none, not finite or out of range.
         """
-        if not (math.isfinite(value) and minimum <= value <= maximum and value > above):
+        if not (_is_number(value) and math.isfinite(value) and minimum <= value <= maximum and value > above):
             lowest = f"above {above:g}" if above > -math.inf else f"at least {minimum:g}"
             raise self.error(f"{name} = {value!r} is not allowed; allowed: {lowest}, at most {maximum:g}")
 
@@ -68,10 +68,14 @@ class NumberChecks:
         """Check a measured time step [s].
 
         Raises:
-            PcwError: as `error`; it is not positive and finite.
+            PcwError: as `error`; it is no number, or not positive and finite.
         """
-        if not (math.isfinite(dt) and dt > 0.0):
+        if not (_is_number(dt) and math.isfinite(dt) and dt > 0.0):
             raise self.error(f"dt = {dt!r} s is not allowed; allowed: above 0, measured from stamps")
+
+
+def _is_number(value: object) -> bool:
+    return hasattr(value, "__float__")
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -430,7 +430,7 @@ def test_finite_readings_never_give_numbers_that_are_not(rows, dt):
 @pytest.mark.parametrize(
     ("field", "value"),
     [("cut_off", 0.0), ("inertia", -1.0), ("memory", 0.0), ("least_speed", math.nan), ("least_slip", 0.3),
-     ("slip_spread", 0.0), ("least_blocks", 1), ("slip_accuracy", 2.0)],
+     ("slip_spread", 0.0), ("least_blocks", 1), ("slip_accuracy", 2.0), ("reach", 0.0), ("cut_off", "20"), ("reach", None)],
 )  # fmt: skip
 def test_parameters_that_are_not_allowed_are_named(field, value):
     with pytest.raises(TerrainError, match=field):
