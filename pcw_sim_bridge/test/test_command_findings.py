@@ -254,6 +254,25 @@ def test_a_busy_network_is_no_drive_that_lags(part, lost):
     assert not findings.named and not findings.leftovers
 
 
+def test_stamps_of_arrival_that_scatter_do_not_tell_what_a_drive_makes_of_its_commands():
+    """Delays of a period as a rule: which command a report answers is open, and a dead time of all drives was named."""
+    plain = recorded(())
+    assert doubtful_reports(ROBOT, through_a_busy_network(plain, 0.25, 0.03)) == {}
+    rng = np.random.default_rng(3)
+
+    def arrived(series):
+        late = rng.exponential(np.median(np.diff(series.stamp)), len(series))
+        return dataclasses.replace(series, stamp=np.maximum.accumulate(series.stamp + late) + 1e-7 * np.arange(len(series)))
+
+    for late in ({"joint_states", "joint_commands"}, {"joint_commands"}):
+        recording = dataclasses.replace(plain, **{name: arrived(getattr(plain, name)) for name in late})
+        doubtful = doubtful_reports(ROBOT, recording)
+        assert set(doubtful) == set(np.ndindex(ROBOT.n, 2))
+        [told] = told_of(ROBOT, doubtful)
+        assert "scatter by" in told and (("joint_states scatter" in told) == ("joint_states" in late))
+        assert command_problems(ROBOT, [recording]) == []
+
+
 def test_a_drive_that_lags_is_found_through_a_busy_network():
     lag = EffectInstance("actuator_lag", ROBOT.caster_names, {"time_constant": 0.004}, "drive")
     recording = through_a_busy_network(recorded([lag]), 0.25, 0.03)

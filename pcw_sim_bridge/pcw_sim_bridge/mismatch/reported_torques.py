@@ -17,6 +17,9 @@ OPPOSITE = -0.5  # correlation of reports with commands, below which one of the 
 # they are in other units, or torques before a gear.
 TOGETHER, LIKELY = 0.8, (0.25, 4.0)
 LEAST_SAMPLES = 200
+# Stamps whose intervals differ from a period by more than this part of it as a rule, those of arrival on a busy network, do
+# not say which command a report answers.
+SCATTERED = 0.2
 LEFT_OUT = "what happens between commands and torques is not looked for there"
 
 
@@ -54,6 +57,7 @@ def doubtful_reports(robot: RobotDescription, recording: Recording) -> dict[tupl
     """Return what is wrong with the torques that joints (caster, axis) reported, of those of which something is."""
     effort, commands = recording.joint_states.effort, held_commands(robot, recording)
     found: dict[tuple[int, int], str] = {}
+    scattered = "" if commands is None else _scattered(recording)
     for i, axis in np.ndindex(robot.n, 2) if effort is not None else ():
         step = coarse_step(effort[:, i, axis])
         factor = None if commands is None else unlikely_factor(commands[:, i, axis], effort[:, i, axis])
@@ -63,7 +67,22 @@ def doubtful_reports(robot: RobotDescription, recording: Recording) -> dict[tupl
             found[i, axis] = "is opposite to what was commanded: one of the two has the wrong sign"
         elif factor is not None:
             found[i, axis] = f"is {factor:.2g} times what was commanded: it has to be the torque at the joint [N m]"
+        elif scattered:
+            found[i, axis] = scattered
     return found
+
+
+def _scattered(recording: Recording) -> str:
+    """Say what is wrong with the stamps of states or commands that scatter; "" where they do not."""
+    for name, series in (("joint_states", recording.joint_states), ("joint_commands", recording.joint_commands)):
+        intervals = np.diff(series.stamp) if series is not None else np.zeros(0)
+        if len(intervals) < LEAST_SAMPLES:
+            continue
+        period = float(np.median(intervals))
+        part = float(np.median(np.abs(intervals - period))) / period
+        if part > SCATTERED:
+            return f"answers some command or other, as stamps of {name} scatter by {part:.0%} of their period"
+    return ""
 
 
 def told_of(robot: RobotDescription, doubtful: dict[tuple[int, int], str]) -> list[str]:
