@@ -277,7 +277,7 @@ class RobotTerrain:
         values[0, :, 0] = reading.sensed[:, 0]
         values[0, :, 1] = reading.sensed[:, 0] - reading.slip[:, 0]
         values[0, :, 2] = reading.force[:, 0]
-        # A load below zero is that of a reading that says nothing.
+        # A load below zero is that of a reading whose slip is not known.
         values[0, :, 3] = loads if reading.known is None else np.where(reading.known, loads, -loads)
         values[0, :, 4] = reading.slip[:, 1]
         values[0, :, 5] = reading.force[:, 1]

@@ -59,8 +59,9 @@ def held_commands(robot: RobotDescription, recording: Recording) -> FloatArray |
     for offset in (-same, SAME_STAMP, same):
         instead = held(joints.stamp + offset)
         nearer = (joints.effort - found) ** 2 - (joints.effort - instead) ** 2
+        nearer = nearer[np.isfinite(nearer)]
         # Roots of squares: else a few leaps of the commands, which any lag leaves far behind, would drown all the rest.
-        nearer = np.sign(nearer[np.isfinite(nearer)]) * np.sqrt(np.abs(nearer[np.isfinite(nearer)]))
+        nearer = np.sign(nearer) * np.sqrt(np.abs(nearer))
         if nearer.sum() > SURE * np.sqrt(np.sum(nearer**2)):
             found, latest = instead, joints.stamp + offset
     if cycle is not None:
