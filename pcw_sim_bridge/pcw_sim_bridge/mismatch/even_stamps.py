@@ -18,13 +18,15 @@ from scipy import ndimage
 
 from pcw_description.recording import Recording
 
+from .late_readings import Turns, late_turns
 from .regression_problem import FloatArray, IntArray
 
 FOLLOWED = 0.05  # part of a difference by which the even time of the next reading is moved
 # Where stamps differ from even ones by more than the first part of a step as a rule, or by more than the second now and then,
-# whose turn a reading is would be a guess.
+# they were not merely a little early or late.
 USUAL_DIFFERENCE, LARGEST_DIFFERENCE = 0.35, 1.5
 LEAST_SHARE = 0.999  # of the readings that are nearer than that
+LEAST_STEP = 0.5  # of the mean one; where the middle one is less, several came at once
 NEXT = 5  # readings of which all but one have to come later where one was lost; one alone was late itself
 PAUSE = 0.1  # [s]; whoever was silent for longer may have begun anew, at times of another phase
 SLOW = 2.0  # [s]; over which clocks that drift are followed
@@ -89,6 +91,24 @@ class EvenStamps:
         return np.concatenate([stamp[p] if times is None else times.stamp for p, times in zip(pieces, even, strict=True)])
 
 
+def late_stamps(recording: Recording, evened: Recording) -> list[str]:
+    """Return a sentence on every topic with stamps of arrival: what they were, and what they are now."""
+    found = []
+    for topic, name in (("joint_states", "joint_states"), ("imu/data", "imu"), ("ground_truth/odom", "ground_truth")):
+        was, now = getattr(recording, name), getattr(evened, name)
+        if was is None or was is now:
+            continue
+        late, step = was.stamp - now.stamp, float(np.median(np.diff(now.stamp)))
+        usual = float(np.std(late))
+        if usual > USUAL_DIFFERENCE * step or np.abs(late).max() > LARGEST_DIFFERENCE * step:
+            found.append(
+                f"{topic}: stamped when it arrived, {1e3 * usual:.2g} ms off as a rule and "
+                f"{1e3 * np.abs(late).max():.2g} ms at most; its readings say that they were taken every {1e3 * step:.3g} ms, "
+                "and are analysed so"
+            )
+    return found
+
+
 @dataclasses.dataclass(frozen=True)
 class _EvenTimes:
     """Even stamps (T,) of a piece, which turn each is (T,), and the step between turns [s]."""
@@ -102,18 +122,34 @@ def _even(stamp: FloatArray) -> _EvenTimes | None:
     """The even times of readings without a pause; None where whose turn each is would be a guess."""
     if len(stamp) < LEAST_READINGS:
         return None
+    found = _trembling(stamp) or late_turns(stamp, SLOW)
+    if found is None:
+        return None
+    rest = found.rest(stamp)
+    mean = _slowly(rest, found.step)
+    # What a computer that was held up stamped late says little of its clock.
+    even = stamp - rest + _slowly(np.clip(rest, mean - found.step, mean + found.step), found.step)
+    return None if np.any(np.diff(even) <= 0.0) else _EvenTimes(even, found.turn, found.step)
+
+
+def _trembling(stamp: FloatArray) -> Turns | None:
+    """Whose turn readings are that were stamped a little early or late; None where it was more than that."""
     step = float(np.median(np.diff(stamp)))
+    if step < LEAST_STEP * (stamp[-1] - stamp[0]) / (len(stamp) - 1):
+        return None
     for _ in range(2):  # a median of trembling steps is no more than nearly the step
         turn = _turns(stamp, step)
-        step, start = map(float, np.polyfit(turn, stamp, 1))
-    rest = stamp - (step * turn + start)
-    even: FloatArray = stamp - rest + ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="reflect")
-    early = stamp - even
+        step = float(np.polyfit(turn, stamp, 1)[0])
+    found = Turns(turn, step)
+    rest = found.rest(stamp)
+    early = rest - _slowly(rest, step)
     near = np.abs(early) < LARGEST_DIFFERENCE * step
     usual = float(np.sqrt(np.mean(early[near] ** 2))) if near.any() else np.inf
-    if np.mean(near) < LEAST_SHARE or usual > USUAL_DIFFERENCE * step or np.any(np.diff(even) <= 0.0):
-        return None
-    return _EvenTimes(even, turn, step)
+    return found if np.mean(near) >= LEAST_SHARE and usual <= USUAL_DIFFERENCE * step else None
+
+
+def _slowly(rest: FloatArray, step: float) -> FloatArray:
+    return np.asarray(ndimage.uniform_filter1d(rest, max(3, round(SLOW / step)), mode="reflect"), dtype=np.float64)
 
 
 def _turns(stamp: FloatArray, step: float) -> IntArray:

@@ -31,7 +31,7 @@ from pcw_description.robot_file import load_robot, robot_to_mapping
 from ..plants.true_robot import as_it_really_is
 from .command_tracking import command_problems, joints_that_report_commands
 from .errors import MismatchError
-from .even_stamps import EvenStamps
+from .even_stamps import EvenStamps, late_stamps
 from .findings import InputFinding
 from .found_effect import effect_instance
 from .joint_glitches import without_glitches
@@ -91,8 +91,10 @@ class RobotSubject:
             joints = recording.joint_states
             recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
         self._check_sensors(path, recording)
-        recording, jumps = without_glitches(EvenStamps().evenly_stamped(recording))
-        warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *jumps]
+        evened = EvenStamps().evenly_stamped(recording)
+        late = late_stamps(recording, evened)
+        recording, jumps = without_glitches(evened)
+        warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *late, *jumps]
         if self._is_lifted(path, recording):
             warnings.append(OFF_GROUND)
         else:

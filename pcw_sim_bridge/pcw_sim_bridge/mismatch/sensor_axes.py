@@ -34,7 +34,7 @@ def unlike_axes(robot: RobotDescription, recording: Recording) -> list[str]:
         robot: the casters of which are all recorded.
         recording: opened with it.
     """
-    stamp, twist = _wheels(robot, recording)
+    stamp, way = _wheels(robot, recording)
     imu, truth = recording.imu, recording.ground_truth
     found: list[str] = []
     for series in (imu, truth):
@@ -44,10 +44,11 @@ def unlike_axes(robot: RobotDescription, recording: Recording) -> list[str]:
         edges = np.arange(begin, end, WINDOW)
         if len(edges) < LEAST_WINDOWS:
             continue
-        wheels = _means(edges, stamp, twist)
+        wheels = _means(edges, stamp, way)
         if series is imu:
             sensed = np.column_stack([imu.acceleration[:, :2], imu.gyro[:, 2]])
-            found += _of_imu(robot, wheels, _means(edges, imu.stamp, sensed))
+            steps = 0.5 * (sensed[1:] + sensed[:-1]) * np.diff(imu.stamp)[:, None]
+            found += _of_imu(robot, wheels, _means(edges, imu.stamp, _summed(steps)))
         elif truth is not None:
             pose = np.stack([np.interp(edges, truth.stamp, column) for column in truth.pose.T], axis=1)
             found += _of_tracker(robot, wheels, pose)
@@ -55,20 +56,26 @@ def unlike_axes(robot: RobotDescription, recording: Recording) -> list[str]:
 
 
 def _wheels(robot: RobotDescription, recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Stamps (T,) and twists of the base (T, 3) by its wheels, where all of them were read."""
+    """Stamps (T,) and the way of the base (T, 3) by its wheels in its own frame, where all of them were read.
+
+    Nothing is divided by the time between two stamps, which may be next to none.
+    """
     joints, numbers = recording.joint_states, ModelNumbers.of(as_it_really_is(robot))
     whole = np.isfinite(joints.position).all(axis=(1, 2))
     stamp, position = joints.stamp[whole], joints.position[whole]
     if len(stamp) < LEAST_WINDOWS:
         return np.array([0.0, 0.0]), np.zeros((2, 3))
-    velocity = np.gradient(position, stamp, axis=0)
-    return stamp, twists(numbers, numbers.headings(position), velocity)[0]
+    heading = numbers.headings(0.5 * (position[1:] + position[:-1]))
+    return stamp, _summed(twists(numbers, heading, np.diff(position, axis=0))[0])
 
 
-def _means(edges: FloatArray, stamp: FloatArray, values: FloatArray) -> FloatArray:
-    """Means (W, K) of signals (T, K) between edges (W + 1,)."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(stamp)[:, None]
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+def _summed(steps: FloatArray) -> FloatArray:
+    """Sums (T, K) of steps (T - 1, K), from 0."""
+    return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _means(edges: FloatArray, stamp: FloatArray, integral: FloatArray) -> FloatArray:
+    """Means (W, K) between edges (W + 1,) of signals with this integral (T, K)."""
     at = np.stack([np.interp(edges, stamp, column) for column in integral.T], axis=1)
     means: FloatArray = np.diff(at, axis=0) / np.diff(edges)[:, None]
     return means
