@@ -7,6 +7,7 @@ more than a small system of equations.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -19,9 +20,10 @@ from .regression_problem import BoolArray, FloatArray, IntArray, RegressionProbl
 from .whitened_regression import Instance, WhitenedRegression
 
 FOLDS = 4  # parts that manoeuvres are dealt out to in turn
-# Held-out data speak against an effect, whatever the fitted ones say, if its work adds so much to their error [nats], and no
-# more than this part of it would be the best there.
-CONTRADICTED, LEAST_PART = 3.0, 0.25
+# Held-out data speak against an effect, if its work adds so much to their error [nats], and no more than this part of it would
+# be the best there; against one for which the fitted ones say more than that, if manoeuvres agree: by so many deviations of
+# their sum.
+CONTRADICTED, LEAST_PART, AGREED = 3.0, 0.25, 2.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +35,8 @@ class HeldOut:
         instances: the effects, as the fitted problem has them; only those `proposed` count, others are fitted beside them.
         columns: of nuisances and effects in `problem` (T, C, k); an effect that it does not show has zeros.
         fold: which fold judges each sample (T,).
-        train, test: Gram matrices of [columns, residual], whitened, per fold (F, k + 1, k + 1).
+        train: Gram matrices of [columns, residual], whitened, per fold (F, k + 1, k + 1).
+        tests: the same of what is judged, per manoeuvre (M, k + 1, k + 1), and which fold judges it (M,), `judge`.
         deviations: prior deviations (k,); nuisances: how many of the k are numbers of the description.
         healthy: changes (nuisances,) up to which these are those of a healthy robot.
         source: what was held out, in words.
@@ -45,7 +48,8 @@ class HeldOut:
     columns: FloatArray
     fold: IntArray
     train: FloatArray
-    test: FloatArray
+    tests: FloatArray
+    judge: IntArray
     deviations: FloatArray
     nuisances: int
     healthy: FloatArray
@@ -75,6 +79,8 @@ class HeldOut:
         white = judged.whiten_columns(flat)
         left = judged.spread(white[:, -1] - white[:, :-1] @ mean)
         white *= np.sqrt(judged.gather(_trust(left, other.valid)))[:, None]
+        number = judged.gather(np.broadcast_to(manoeuvres(other)[:, None], other.valid.shape))
+        tests = np.stack([white[number == m].T @ white[number == m] for m in np.unique(number)])
         count = len(np.unique(other.recording))
         return cls(
             other,
@@ -83,7 +89,8 @@ class HeldOut:
             columns,
             everything,
             train[None],
-            (white.T @ white)[None],
+            tests,
+            np.zeros(len(tests), dtype=np.int64),
             deviations,
             len(problem.nuisances),
             np.array([nuisance.healthy for nuisance in problem.nuisances]),
@@ -108,12 +115,18 @@ class HeldOut:
             _columns_elsewhere(problem, instances, problem),
             number % FOLDS,
             test.sum(axis=0) - test,
-            test,
+            grams,
+            labels,
             regression.deviations(instances),
             len(problem.nuisances),
             np.array([nuisance.healthy for nuisance in problem.nuisances]),
             f"{count} manoeuvres of the fitted recordings, each predicted from others",
         )
+
+    @property
+    def test(self) -> FloatArray:
+        """Gram matrices of what each fold judges (F, k + 1, k + 1)."""
+        return np.stack([self.tests[self.judge == fold].sum(axis=0) for fold in range(len(self.train))])
 
     def _kept(self, without: int | None) -> IntArray:
         """Positions of the columns without those of one effect."""
@@ -163,10 +176,18 @@ class HeldOut:
             better = max(better, self._error(self._healthy_means(index, self._limits(both))) - self._error(both))
         rows = slice(*self.span(index))
         work = 0.5 * float(sum(m[rows] @ gram[rows, rows] @ m[rows] for m, gram in zip(both, self.test, strict=True)))
-        smaller = self._error(self._idle(index)) - self._error(both)
+        by_manoeuvre = self._errors(self._idle(index)) - self._errors(both)
+        smaller = float(by_manoeuvre.sum())
         # The error is a parabola of the part of the effect that is at work, and least at (1 + smaller / work) / 2 of it.
-        contradicted = smaller < -CONTRADICTED and smaller < (2.0 * LEAST_PART - 1.0) * work
+        contradicted = smaller < min(-CONTRADICTED, (2.0 * LEAST_PART - 1.0) * work)
+        if contradicted and -smaller < self._fitted(index):
+            contradicted = smaller < -AGREED * _deviation_of_sum(by_manoeuvre)
         return smaller if contradicted else better, work
+
+    def _fitted(self, index: int) -> float:
+        """What the fitted data say for an effect [nats], on average over the folds."""
+        kept, everything = self._kept(index), self._kept(None)
+        return float(np.mean([self._log_evidence(g, everything) - self._log_evidence(g, kept) for g in self.train]))
 
     def is_smaller_with(self, index: int) -> bool:
         """Whether the error of held-out data is smaller with an effect than with nothing in its place, and than without it."""
@@ -196,8 +217,12 @@ class HeldOut:
 
     def _error(self, means: FloatArray) -> float:
         """Half the squared error of all folds with numbers (F, k), whitened."""
-        extended = [np.append(-mean, 1.0) for mean in means]
-        return 0.5 * float(sum(x @ gram @ x for x, gram in zip(extended, self.test, strict=True)))
+        return float(self._errors(means).sum())
+
+    def _errors(self, means: FloatArray) -> FloatArray:
+        """The same of every manoeuvre (M,)."""
+        extended = np.concatenate([-means, np.ones((len(means), 1))], axis=1)[self.judge]
+        return 0.5 * np.einsum("mi,mij,mj->m", extended, self.tests, extended)
 
     def _retuning(self, means: FloatArray) -> float:
         """Half the squared distance of the description's numbers from nominal, in tolerances."""
@@ -217,6 +242,11 @@ class HeldOut:
         factor = np.linalg.cholesky(np.outer(deviations, deviations) * gram[np.ix_(kept, kept)] + np.eye(len(kept)))
         half = np.linalg.solve(factor, deviations * gram[kept, -1])
         return -float(np.sum(np.log(np.diag(factor)))) - 0.5 * float(gram[-1, -1] - half @ half)
+
+
+def _deviation_of_sum(parts: FloatArray) -> float:
+    """Standard deviation of a sum by what its parts (M,) differ by; 0 of one, which says nothing of that."""
+    return float(np.std(parts) * len(parts) / math.sqrt(max(len(parts) - 1, 1)))
 
 
 def _trust(left: FloatArray, valid: BoolArray) -> FloatArray:
