@@ -52,6 +52,7 @@ from .safety import (
     Reaction,
     SafetyGate,
 )
+from .steady_path import SteadyPath
 from .torque_limits import LimitedTorque, TorqueLimits, limit_torque
 from .wheel_loads import (
     WheelLoads,
@@ -92,6 +93,7 @@ __all__ = [
     "SharedForces",
     "SlidingModeRate",
     "SlidingModeRateParameters",
+    "SteadyPath",
     "TorqueLimits",
     "TractionLimitAvoidance",
     "TractionLimitParameters",

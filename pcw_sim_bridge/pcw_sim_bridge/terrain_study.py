@@ -23,17 +23,14 @@ from pcw_control.computed_torque import ComputedTorque
 from pcw_control.controller_interface import ControllerMeasurement
 from pcw_control.quintic_trajectory import TrajectoryPoint
 from pcw_control.torque_limits import TorqueLimits, limit_torque
-from pcw_description.odometry import OdometryParameters, OdometryState, update
+from pcw_description.odometry import OdometryParameters, update
 from pcw_description.odometry import initial_state as initial_odometry
 from pcw_description.robot_description import STEER, ContactDescription, FloatArray, RobotDescription
 from pcw_description.robot_file import load_robot
-from pcw_estimation.robot_sliding_mode_observer import RobotSlidingModeObserver
-from pcw_estimation.sliding_mode_observer import SlidingModeParameters
 from pcw_estimation.slip_estimate import JointMeasurement
-from pcw_terrain.active_identification import ActiveIdentification, ActiveMeasurement, ActiveOutput, Phase
-from pcw_terrain.active_record import ActiveRecord
-from pcw_terrain.robot_terrain import RobotTerrain, RobotTerrainEstimate
+from pcw_terrain.active_identification import Phase
 
+from .ground_test import GroundTest, GroundTestParameters, shifted
 from .plants.factory import make_plant
 from .sensors import JointReading
 from .simulated_robot import JointCommand, SimulatedRobot
@@ -92,31 +89,6 @@ def line(now: float, heading: float) -> TrajectoryPoint:
     return TrajectoryPoint(way * direction, velocity * direction, acceleration * direction)
 
 
-class _Knowledge:
-    """What is believed of the ground under each caster: what its test said, else the mean of the others', else the file's."""
-
-    def __init__(self, robot: RobotDescription) -> None:
-        n = robot.n
-        self.mu_p, self.lambda_p = np.full(n, np.nan), np.full(n, np.nan)
-        self.covariance = np.full((n, 2, 2), np.inf)
-        self.valid, self._file = np.zeros(n, dtype=bool), robot
-
-    def believed(self) -> tuple[FloatArray, FloatArray]:
-        mu_p = np.array([tyre.mu_p for tyre in self._file.tyres])
-        lambda_p = np.array([tyre.lambda_p for tyre in self._file.tyres])
-        if self.valid.any():
-            mu_p[:] = np.exp(np.mean(np.log(self.mu_p[self.valid])))
-            lambda_p[:] = np.exp(np.mean(np.log(self.lambda_p[self.valid])))
-        return np.where(self.valid, self.mu_p, mu_p), np.where(self.valid, self.lambda_p, lambda_p)
-
-
-def _shifted(odometry: OdometryState, moved: FloatArray) -> OdometryState:
-    """Return the odometry after a motion (3,) in base_link that it had missed."""
-    c, s = np.cos(odometry.pose[2]), np.sin(odometry.pose[2])
-    shift = np.array([c * moved[0] - s * moved[1], s * moved[0] + c * moved[1], moved[2]])
-    return dataclasses.replace(odometry, pose=odometry.pose + shift)
-
-
 def active_run(
     real: RobotDescription, believed: RobotDescription, plant: str, seed: int, measured: str = "angle", heading: float = 0.0
 ) -> ActiveRun:
@@ -137,12 +109,9 @@ def active_run(
     controller = ComputedTorque(believed)
     control = controller.initial_state()
     limits, torque, asked = TorqueLimits.of_robot(believed), np.zeros((n, 2)), np.zeros((n, 2))
-    observer = RobotSlidingModeObserver(believed, SlidingModeParameters(measured=measured))
-    observed = observer.initial_state()
-    terrain, active = RobotTerrain(believed), ActiveIdentification(believed)
-    record, testing, live = ActiveRecord(terrain, active), active.initial_state(), terrain.initial_state()
+    test = GroundTest(believed, GroundTestParameters(measured))
+    state = test.initial_state()
     odometry, odometry_parameters = initial_odometry(), OdometryParameters()
-    knowledge, output, position_before = _Knowledge(believed), None, None
     saturated, before, requested, ended, predicted = False, -1, False, 0.0, 0.0
     errors: list[FloatArray] = []
     while simulated.time_ns < LONGEST * 1e9:
@@ -150,36 +119,14 @@ def active_run(
         assert isinstance(reading, JointReading)  # the joints come last
         dt = (simulated.time_ns - before) * 1e-9 if before >= 0 else simulated.control_period
         before, now = simulated.time_ns, simulated.time_ns * 1e-9
-        velocity = reading.velocity
-        if measured == "angle":
-            velocity = np.zeros((n, 2)) if position_before is None else (reading.position - position_before) / dt
-        position_before = reading.position
-        observed, estimate = observer.step(observed, JointMeasurement(reading.position, reading.velocity, reading.effort), dt)
-        loads = terrain.normal_force(np.ascontiguousarray(reading.position[:, STEER]), estimate.force)
-        mu_p, lambda_p = knowledge.believed()
-        measurement = ActiveMeasurement(
-            reading.position, velocity, estimate.force, asked, loads, knowledge.valid.copy(), mu_p, lambda_p
-        )
-        if not requested and now >= REQUESTED:
-            testing, requested = active.request(testing), True
-            predicted = active.predict(reading.position[:, STEER], 0, loads).path
-        under_test = output.testing if output is not None else -1
-        before_test = measurement
-        if under_test >= 0:
-            assert output is not None
-            live, now_known = terrain.step_with_twist(
-                live, reading.position, velocity, reading.effort, output.twist, dt, np.arange(n) == under_test
-            )
-            measurement = _with_live(measurement, now_known, under_test)
-        testing, output = active.step(testing, measurement, dt)
-        if under_test >= 0:
-            record.add(before_test, reading.effort, output.twist, dt)
-        if under_test >= 0 and output.testing != under_test:
-            odometry, live = _learn(record, under_test, knowledge, odometry), terrain.initial_state()
-        odometry, _ = update(believed, odometry_parameters, odometry, output.controller_position, dt)
-        seen = ControllerMeasurement(
-            output.controller_position, _speeds(output, reading, measured), odometry.pose, saturated
-        )
+        begins = not requested and now >= REQUESTED
+        if begins:
+            state, requested = test.request(state), True
+        state, output = test.step(state, JointMeasurement(reading.position, reading.velocity, reading.effort), asked, dt)
+        if begins:
+            predicted = test.active.predict(reading.position[:, STEER], 0, output.normal_force).path
+        odometry, _ = update(believed, odometry_parameters, shifted(odometry, output.missed), output.position, dt)
+        seen = ControllerMeasurement(output.position, output.velocity, odometry.pose, saturated)
         point = line(now, heading)
         control, wanted = controller.step(control, seen, point, dt)
         asked = wanted.torque
@@ -187,7 +134,7 @@ def active_run(
         torque, saturated = limited.torque, limited.saturated
         simulated.command(JointCommand(effort=torque))
         errors.append(np.array([now, *(simulated.plant.state().pose - point.pose), output.testing]))
-        if requested and testing.phase in (Phase.DONE, Phase.REFUSED):
+        if requested and state.testing.phase in (Phase.DONE, Phase.REFUSED):
             ended = ended or now
             if now > ended + AFTERWARDS:
                 break
@@ -198,40 +145,12 @@ def active_run(
     c, s = np.cos(heading), np.sin(heading)
     along, across = c * error[:, 1] + s * error[:, 2], c * error[:, 2] - s * error[:, 1]
     error[:, 1], error[:, 2] = along, across
+    ground = state.ground
     return ActiveRun(
-        knowledge.mu_p, knowledge.lambda_p, knowledge.covariance, knowledge.valid,
-        (ended or LONGEST) - REQUESTED, testing.refusal.value,
+        ground.mu_p, ground.lambda_p, ground.covariance, ground.valid,
+        (ended or LONGEST) - REQUESTED, state.testing.refusal.value,
         float(np.abs(along).max()), float(np.abs(across).max()), float(np.abs(error[:, 3]).max()), predicted, error,
     )  # fmt: skip
-
-
-def _speeds(output: ActiveOutput, reading: JointReading, measured: str) -> FloatArray:
-    """Return the joint speeds that the controller is given; its own drives measure them, whatever the observer does."""
-    if measured == "speed" or output.testing >= 0:
-        return output.controller_velocity
-    return reading.velocity
-
-
-def _with_live(measurement: ActiveMeasurement, found: RobotTerrainEstimate, caster: int) -> ActiveMeasurement:
-    """Return the measurement with what is known already of the caster under test, so that its test ends in time."""
-    if not found.valid[caster]:
-        return measurement
-    at = np.arange(len(measurement.known)) == caster
-    return dataclasses.replace(
-        measurement, known=measurement.known | at, mu_p=np.where(at, found.mu_p, measurement.mu_p),
-        lambda_p=np.where(at, found.lambda_p, measurement.lambda_p),
-    )  # fmt: skip
-
-
-def _learn(record: ActiveRecord, caster: int, knowledge: _Knowledge, odometry: OdometryState) -> OdometryState:
-    """Take what a test says into what is known; returns the odometry with what it had missed."""
-    _, found, moved = record.identify(caster)
-    record.clear()
-    if not found.valid[caster]:
-        return odometry
-    knowledge.mu_p[caster], knowledge.lambda_p[caster] = found.mu_p[caster], found.lambda_p[caster]
-    knowledge.covariance[caster], knowledge.valid[caster] = found.covariance[caster], True
-    return _shifted(odometry, moved)
 
 
 def random_ground(seed: int) -> tuple[float, float]:

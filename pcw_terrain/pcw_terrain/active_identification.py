@@ -317,6 +317,33 @@ class ActiveIdentification:
             return self._ended(state, Refusal.CANCELLED)
         return dataclasses.replace(state, queue=state.queue[:1], refusal=Refusal.CANCELLED)
 
+    def drop(self, state: ActiveState) -> ActiveState:
+        """Return the state with all ended at once and no wheel brought back: for where the torque is taken away.
+
+        Joints are seen as before, without a jump: `rolled_ahead` stays.
+        """
+        if state.phase in (Phase.IDLE, Phase.DONE, Phase.REFUSED):
+            return state
+        return dataclasses.replace(
+            state, phase=Phase.REFUSED, queue=(), elapsed=0.0, slip=0.0, integral=0.0, refusal=Refusal.CANCELLED
+        )
+
+    def reason_against(self, state: ActiveState, measurement: ActiveMeasurement, caster: int) -> Refusal:
+        """Return why the test of a caster would not begin now; `Refusal.NONE` where it would.
+
+        Args:
+            state: as it is, without a request.
+            measurement: what is known now.
+            caster: its index.
+
+        Raises:
+            TerrainError: as `request` and `step`.
+        """
+        p = self.parameters
+        asked = dataclasses.replace(self.request(state, (caster,)), elapsed=p.rest_time)
+        after, _ = self.step(asked, measurement, 1e-6)
+        return Refusal.NONE if after.phase is Phase.SLIP else after.refusal
+
     def predict(
         self, steer_angle: FloatArray, caster: int, normal_force: FloatArray, mu_p: float | None = None
     ) -> Disturbance:

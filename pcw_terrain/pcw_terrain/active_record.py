@@ -10,12 +10,13 @@ force.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
 from pcw_description.robot_description import FloatArray
 
-from .active_identification import ActiveIdentification, ActiveMeasurement
+from .active_identification import ActiveIdentification, ActiveMeasurement, ActiveState
 from .errors import TerrainError, require_dt
 from .robot_terrain import RobotTerrain, RobotTerrainEstimate
 from .terrain_estimator import TerrainState
@@ -24,11 +25,47 @@ ROUNDS = 6
 
 
 @dataclasses.dataclass(frozen=True)
-class _Instant:
+class Instant:
+    """One cycle of a test; see `ActiveRecord.add`."""
+
     measurement: ActiveMeasurement
     effort: FloatArray
     twist: FloatArray
     dt: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """How far the rounds over a record have come; made by `ActiveRecord.begin`.
+
+    Attributes:
+        caster: the one that was tested.
+        used: motion that odometry went on by (3,) [m, m, rad] in base_link.
+        mu_p, lambda_p: of the ground, as this round believes (n,) [1].
+        active, terrain: states within this round.
+        path: motion by this round so far (3,) [m, m, rad] in base_link.
+        estimate: after the last cycle that was gone over; None before the first.
+        round: rounds that are done.
+        at: cycle of the record that is next.
+        finished: nothing is left to do.
+    """
+
+    caster: int
+    used: FloatArray
+    mu_p: FloatArray
+    lambda_p: FloatArray
+    active: ActiveState
+    terrain: TerrainState
+    path: FloatArray
+    estimate: RobotTerrainEstimate | None = None
+    round: int = 0
+    at: int = 0
+    finished: bool = False
+
+    @property
+    def missed(self) -> FloatArray:
+        """Motion (3,) [m, m, rad] in base_link that an odometry on `ActiveOutput.controller_position` has missed."""
+        return self.path - self.used
 
 
 class ActiveRecord:
@@ -37,11 +74,12 @@ class ActiveRecord:
     Args:
         terrain: the estimators of the robot.
         active: what makes the casters slip.
+        instants: what has been noted so far.
     """
 
-    def __init__(self, terrain: RobotTerrain, active: ActiveIdentification) -> None:
+    def __init__(self, terrain: RobotTerrain, active: ActiveIdentification, instants: Iterable[Instant] = ()) -> None:
         self._terrain, self._active = terrain, active
-        self._instants: list[_Instant] = []
+        self._instants: list[Instant] = list(instants)
 
     def __len__(self) -> int:
         return len(self._instants)
@@ -56,7 +94,7 @@ class ActiveRecord:
             dt: time since the cycle before [s].
         """
         require_dt(dt)
-        self._instants.append(_Instant(measurement, effort.copy(), twist.copy(), dt))
+        self._instants.append(Instant(measurement, effort.copy(), twist.copy(), dt))
 
     def clear(self) -> None:
         """Forget all."""
@@ -72,30 +110,57 @@ class ActiveRecord:
         Raises:
             TerrainError: nothing has been noted.
         """
+        replay = self.advance(self.begin(caster), ROUNDS * len(self._instants))
+        assert replay.estimate is not None
+        return replay.terrain, replay.estimate, replay.missed
+
+    def begin(self, caster: int) -> Replay:
+        """Return where to begin with what `identify` does, to go on a few cycles at a time while the robot drives.
+
+        Raises:
+            TerrainError: nothing has been noted.
+        """
         if not self._instants:
             raise TerrainError("a record of 0 cycles is not allowed; allowed: at least 1")
-        n, last = self._terrain.n, self._instants[-1].measurement
-        mu_p, lambda_p = last.mu_p.copy(), last.lambda_p.copy()
-        follows = ~last.known
-        follows[caster] = True
-        only = np.arange(n) == caster
+        last = self._instants[-1].measurement
         used = np.sum([instant.dt * instant.twist for instant in self._instants], axis=0)
-        path = used
-        estimate: RobotTerrainEstimate
-        for _ in range(ROUNDS):
-            path = np.zeros(3)
-            active, state = self._active.initial_state(), self._terrain.initial_state()
-            for instant in self._instants:
-                measurement = dataclasses.replace(instant.measurement, mu_p=mu_p, lambda_p=lambda_p)
-                active, twist = self._active.twist_of_others(active, measurement, caster, instant.dt)
-                state, estimate = self._terrain.step_with_twist(
-                    state, measurement.position, measurement.velocity, instant.effort, twist, instant.dt, only
-                )
-                path += instant.dt * twist
-            if not np.isfinite(estimate.mu_p[caster]):
+        return Replay(
+            caster, used, last.mu_p.copy(), last.lambda_p.copy(), self._active.initial_state(),
+            self._terrain.initial_state(), np.zeros(3),
+        )  # fmt: skip
+
+    def advance(self, replay: Replay, cycles: int) -> Replay:
+        """Return the replay after so many cycles more, or after its last.
+
+        The end is the same whatever the numbers of cycles: `estimate`, of which only that of `caster` has been estimated.
+        """
+        for _ in range(cycles):
+            if replay.finished:
                 break
-            mu_p, lambda_p = (
-                np.where(follows, estimate.mu_p[caster], mu_p),
-                np.where(follows, estimate.lambda_p[caster], lambda_p),
-            )
-        return state, estimate, path - used
+            replay = self._after_one(replay)
+        return replay
+
+    def _after_one(self, replay: Replay) -> Replay:
+        caster, n = replay.caster, self._terrain.n
+        instant = self._instants[replay.at]
+        measurement = dataclasses.replace(instant.measurement, mu_p=replay.mu_p, lambda_p=replay.lambda_p)
+        active, twist = self._active.twist_of_others(replay.active, measurement, caster, instant.dt)
+        terrain, estimate = self._terrain.step_with_twist(
+            replay.terrain, measurement.position, measurement.velocity, instant.effort, twist, instant.dt,
+            np.arange(n) == caster,
+        )  # fmt: skip
+        path, at = replay.path + instant.dt * twist, replay.at + 1
+        replay = dataclasses.replace(replay, active=active, terrain=terrain, path=path, estimate=estimate, at=at)
+        return replay if at < len(self._instants) else self._after_round(replay, estimate)
+
+    def _after_round(self, replay: Replay, estimate: RobotTerrainEstimate) -> Replay:
+        caster, done = replay.caster, replay.round + 1
+        if not np.isfinite(estimate.mu_p[caster]) or done == ROUNDS:
+            return dataclasses.replace(replay, round=done, finished=True)
+        follows = ~self._instants[-1].measurement.known
+        follows[caster] = True
+        return dataclasses.replace(
+            replay, mu_p=np.where(follows, estimate.mu_p[caster], replay.mu_p),
+            lambda_p=np.where(follows, estimate.lambda_p[caster], replay.lambda_p), active=self._active.initial_state(),
+            terrain=self._terrain.initial_state(), path=np.zeros(3), round=done, at=0,
+        )  # fmt: skip
