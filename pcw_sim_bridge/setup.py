@@ -51,6 +51,7 @@ setup(
             "can_log = pcw_sim_bridge.can.can_log:main",
             "can_steer_zero = pcw_sim_bridge.can.can_steer_zero:main",
             "drive_emulator = pcw_sim_bridge.can.drive_emulator:main",
+            "ground_test_controller = pcw_sim_bridge.nodes.ground_test_controller:main",
             "markers = pcw_sim_bridge.nodes.markers:main",
             "mismatch = pcw_sim_bridge.mismatch.__main__:main",
             "mismatch_monitor = pcw_sim_bridge.nodes.mismatch_monitor:main",

@@ -20,6 +20,7 @@ NODES = {
     "computed_torque": ("pcw_control.nodes.computed_torque", "ComputedTorqueNode"),
     "controller": ("pcw_control.nodes.controller", "ControllerNode"),
     "encoder_slip": ("pcw_estimation.nodes.encoder_slip", "EncoderSlipNode"),
+    "ground_test_controller": ("pcw_sim_bridge.nodes.ground_test_controller", "GroundTestControllerNode"),
     "imu_slip": ("pcw_estimation.nodes.imu_slip", "ImuSlipNode"),
     "markers": ("pcw_sim_bridge.nodes.markers", "MarkersNode"),
     "mismatch_monitor": ("pcw_sim_bridge.nodes.mismatch_monitor", "MismatchMonitorNode"),

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,6 +251,12 @@ def estimate(caster, mu_p, lambda_p):
 def test_parameters_are_checked(field, value, allowed):
     with pytest.raises(TerrainError, match=rf"{field} = .*{value}.*{allowed}"):
         GroundTestParameters(**{field: value})
+
+
+def test_the_readme_names_the_controllers_that_it_works_with():
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    [named] = re.findall(r"shown to work with: (.*?)\.\s", readme, flags=re.DOTALL)
+    assert sorted(re.findall(r"`(\w+)`", named)) == sorted(ground_test.WORKS_WITH)
 
 
 def test_odometry_is_shifted_in_the_frame_of_the_robot():

@@ -84,6 +84,7 @@ class ControllerNode(RobustLifecycleNode):
             check=self._reason_against,
         )
         declare_controller_parameters(self, robot)
+        self._declare_more()
         all_declared(self)
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
         self._message = JointState(name=list(robot.joint_names))
@@ -97,6 +98,26 @@ class ControllerNode(RobustLifecycleNode):
         if autostart:
             self.trigger_configure()
             self.trigger_activate()
+
+    # --- What a subclass may add ------------------------------------------------------------------------
+
+    def _declare_more(self) -> None:
+        """Declare parameters of one's own."""
+
+    def _seen(
+        self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the joint angles and speeds (n, 2) by which odometry and controller go: as they are measured.
+
+        Called once for each joint_states in use; `dt` is None where there is no time step, and effort NaN where not sent.
+        """
+        return position, velocity
+
+    def _with_more(self, torque: np.ndarray) -> np.ndarray:
+        """Return the torque (n, 2) that goes to the gate for the one that the controller asks for."""
+        return torque
+
+    # --- Parameters -------------------------------------------------------------------------------------
 
     def _reason_against(self, name: str) -> str | None:
         """Say why a controller cannot take over now; None when it can."""
@@ -315,7 +336,8 @@ class ControllerNode(RobustLifecycleNode):
             self._send({"exception"})
 
     def _control(self, message: JointState, dt: float | None) -> None:
-        position, velocity, _ = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
+        position, measured_velocity, effort = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
+        position, velocity = self._seen(position, measured_velocity, effort, dt)
         if dt is None:
             # Before the first dt there is no odometry; after a gap or a jump the pose is kept and the motion between unknown.
             self._odometry = odometry.initial_state(self._odometry.pose)
@@ -342,7 +364,7 @@ class ControllerNode(RobustLifecycleNode):
         self._state, output = self._controller.step(self._state, measurement, reference, dt)
         self._reference_twist = output.reference_twist
         self._handover, torque = handover.step(self._handover, output.torque, dt)
-        self._send(hazards, torque, velocity, dt)
+        self._send(hazards, self._with_more(torque), measured_velocity, dt)
 
     def _send(
         self, hazards: set[str], torque: np.ndarray | None = None, velocity: np.ndarray | None = None, dt: float | None = None
