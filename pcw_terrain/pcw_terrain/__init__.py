@@ -4,6 +4,7 @@ from .active_identification import ActiveIdentification, ActiveMeasurement, Acti
 from .active_record import ActiveRecord
 from .errors import TerrainError
 from .ground_catalogue import GROUNDS, Ground, contact_on, ground, robot_on
+from .ground_from_tests import GroundFromTests
 from .observed_ground import ObservedGround, ObservedGroundOutput, ObservedGroundState
 from .robot_terrain import RobotReading, RobotTerrain, RobotTerrainEstimate
 from .shared_friction import SharedFriction, shared_friction
@@ -21,6 +22,7 @@ __all__ = [
     "ActiveParameters",
     "ActiveRecord",
     "Ground",
+    "GroundFromTests",
     "MapParameters",
     "ObservedGround",
     "ObservedGroundOutput",

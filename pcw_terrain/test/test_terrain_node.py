@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState  # noqa: E402
 
 from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
-from pcw_description.nodes.node_tools import ns_to_stamp, stamp_to_ns  # noqa: E402
+from pcw_description.nodes.node_tools import LATCHED, ns_to_stamp, stamp_to_ns  # noqa: E402
 from pcw_terrain import RobotTerrain  # noqa: E402
 
 THESIS = load_robot("thesis")
@@ -92,6 +92,26 @@ def values_of(diagnostics):
 
 def finite(messages):
     return all(np.isfinite([*m.position, *m.velocity, *m.effort]).all() for m in messages)
+
+
+def test_what_a_test_has_told_counts_until_the_wheel_itself_has_felt_its_ground(ros):
+    """A test that has just ended is heard, and one of long ago, which a node that starts late is sent, is not."""
+    _, terrain, diagnostics, robot = start(ros)
+    grip, tested = ros.listen(JointState, "terrain/grip"), ros.peer.create_publisher(JointState, "terrain/tested", LATCHED)
+    told = JointState(name=["front_left"], position=[0.15], effort=[0.6])
+    told.header.stamp = ns_to_stamp(robot.time_ns)
+    robot.time_ns += 30_000_000_000
+    tested.publish(told)
+    robot.run(lambda: len(terrain) > 5)
+    assert all("front_left" not in m.name for m in terrain[:5])
+    told.header.stamp = ns_to_stamp(robot.time_ns - 500_000_000)
+    tested.publish(told)
+    robot.run(lambda: terrain and list(terrain[-1].name) == ["front_left"])
+    assert (terrain[-1].effort[0], terrain[-1].position[0]) == (0.6, 0.15) and len(terrain[-1].velocity) == 1
+    robot.run(lambda: grip[-1].effort[0] == 0.6)
+    robot.run(lambda: len(terrain[-1].name) == 4 and terrain[-1].effort[0] != 0.6)
+    assert terrain[-1].effort[0] == pytest.approx(MU, rel=0.1)
+    robot.run(lambda: values_of(diagnostics).get("known_by_tests") == "0")
 
 
 def test_it_finds_the_ground_names_its_kind_and_draws_the_map(ros):

@@ -30,6 +30,7 @@ from pcw_description.nodes.node_tools import (
 from pcw_description.robot_description import STEER
 
 from ..errors import TerrainError
+from ..ground_from_tests import GroundFromTests
 from ..observed_ground import ObservedGround
 from ..robot_terrain import RobotReading, RobotTerrainEstimate
 from ..shared_friction import shared_friction
@@ -41,15 +42,17 @@ from .same_stamp import SameStamp
 SOURCES = ("observer", "odom")
 # Motion older than this against joint_states is not used [s].
 OLDEST = 0.05
+# Tests that ended longer ago against joint_states are not used, as the way since then is not known [s].
+OLDEST_TEST = 10.0
 
 
 class TerrainNode(Node):
     """Steps the estimators and publishes at a lower rate.
 
     A step takes joint_states and slip/observer of the same stamp, whichever comes first, so that speeds and slips belong
-    together; with odom, every joint_states. terrain holds the casters whose ground is vouched for, and those that stand on a
-    place of the map that is known; terrain/grip holds all of them, by what forces may be shared. After a gap or a jump back in
-    time the estimators begin anew; the map stays.
+    together; with odom, every joint_states. terrain holds the casters whose ground is vouched for, those of which a test has
+    told (terrain/tested), and those that stand on a place of the map that is known; terrain/grip holds all of them, by what
+    forces may be shared. After a gap or a jump back in time the estimators begin anew; the map stays.
     """
 
     def __init__(self) -> None:
@@ -76,6 +79,7 @@ class TerrainNode(Node):
         self._begin_anew()
         self._longest_gap = longest_gap
         self._odom: tuple[int, np.ndarray, np.ndarray] | None = None
+        self._heard: JointState | None = None  # of terrain/tested, until the next step
         self._watch, self._unusable, self._problems = StampWatch(longest_gap), 0, Problems(self)
         self._silence = Silence(self._watch)
         self._due, self._map_due = Decimator(rate), Decimator(map_rate)
@@ -83,6 +87,7 @@ class TerrainNode(Node):
         directions = [
             f"{caster}_{direction}" for caster in self.robot.caster_names for direction in ("longitudinal", "lateral")
         ]
+        self._caster_index = {name: i for i, name in enumerate(self.robot.caster_names)}
         self._slip_index = {name: i for i, name in enumerate(directions)}
         self._publisher = self.create_publisher(JointState, "terrain", SENSOR_SOURCE)
         self._grip_publisher = self.create_publisher(JointState, "terrain/grip", SENSOR_SOURCE)
@@ -92,12 +97,14 @@ class TerrainNode(Node):
         self.create_subscription(Odometry, "odom", self._on_odom, SENSOR_STREAM)
         if self._source == "observer":
             self.create_subscription(JointState, "slip/observer", self._on_slip, SENSOR_STREAM)
+            self.create_subscription(JointState, "terrain/tested", self._on_tested, LATCHED)
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="ground", parts=self._parts)
 
     def _begin_anew(self) -> None:
         self._state, self._observed = self._terrain.initial_state(), self._ground.initial_state()
         self._estimate: RobotTerrainEstimate | None = None
         self._grip: SlipSlopeEstimate | None = None
+        self._tests = GroundFromTests.nothing(self.robot.n)
         self._same_stamp, self._stepped_at = SameStamp(), 0
 
     def _warm_up(self) -> None:
@@ -108,6 +115,9 @@ class TerrainNode(Node):
 
     def _on_slip(self, message: JointState) -> None:
         self._take(self._same_stamp.second(stamp_to_ns(message.header.stamp), message))
+
+    def _on_tested(self, message: JointState) -> None:
+        self._heard = message
 
     def _on_odom(self, message: Odometry) -> None:
         position, q, twist = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist
@@ -144,7 +154,7 @@ class TerrainNode(Node):
             self._check(position, velocity)
             if slip is None:
                 self._by_odom(position, velocity, effort, dt)
-            elif not self._by_observer(position, velocity, slip, dt):
+            elif not self._by_observer(position, velocity, slip, dt, now):
                 return
         except PcwError as error:
             self._watch.take_back()
@@ -170,7 +180,7 @@ class TerrainNode(Node):
             self._state, position, velocity, effort, self._odom[2], dt
         )
 
-    def _by_observer(self, position: np.ndarray, velocity: np.ndarray, message: JointState, dt: float) -> bool:
+    def _by_observer(self, position: np.ndarray, velocity: np.ndarray, message: JointState, dt: float, now: int) -> bool:
         """Step with what the observer says; returns whether it vouches for the forces at least."""
         _, slip, force = joint_state_arrays(message, self._slip_index, (self.robot.n, 2))
         if not np.isfinite(force).all():
@@ -181,7 +191,20 @@ class TerrainNode(Node):
         reading = RobotReading(sensed, slip, force, steer_angle, np.full(self.robot.n, slip_known))
         self._observed, found = self._ground.step(self._observed, reading, dt)
         self._estimate, self._grip = found.ground, found.slopes
+        self._hear_tests(np.abs(sensed[:, 0]), now)
+        self._tests = self._tests.step(found.ground, force, sensed[:, 0], dt)
         return True
+
+    def _hear_tests(self, speed: np.ndarray, now: int) -> None:
+        """Take in what terrain/tested has told since the last step, at speeds (n,) of the wheels."""
+        message = self._heard
+        if message is None or (age := (now - stamp_to_ns(message.header.stamp)) * 1e-9) < 0.0:
+            return
+        self._heard = None
+        if age > OLDEST_TEST:
+            return
+        critical, _, friction = joint_state_arrays(message, self._caster_index, (self.robot.n,))
+        self._tests = self._tests.hear(friction, critical, speed * age)
 
     def _places(self, now: int) -> np.ndarray | None:
         """Return where the steering axes are in the map (n, 2) [m], None where the pose is not known."""
@@ -199,11 +222,13 @@ class TerrainNode(Node):
             self._map.add(places[i, 0], places[i, 1], estimate.mu_p[i], estimate.lambda_p[i], estimate.covariance[i])
 
     def _known(self, estimate: RobotTerrainEstimate, now: int) -> dict[str, tuple[float, float, float]]:
-        """Return lambda_p, current slip and mu_p of casters whose ground is known, from estimates or else from the map."""
+        """Return lambda_p, current slip and mu_p of casters whose ground is known: by estimates, else tests, else the map."""
         places, found = self._places(now), {}
         for i, name in enumerate(self.robot.caster_names):
             if estimate.valid[i]:
                 found[name] = (estimate.lambda_p[i], estimate.slip[i], estimate.mu_p[i])
+            elif self._tests.known[i]:
+                found[name] = (self._tests.lambda_p[i], estimate.slip[i], self._tests.mu_p[i])
             elif places is not None and (place := self._map.at(places[i, 0], places[i, 1])) is not None:
                 found[name] = (place.lambda_p, estimate.slip[i], place.mu_p)
         return found
@@ -220,7 +245,7 @@ class TerrainNode(Node):
             self._begin_anew()
             return
         self._publisher.publish(message)
-        told = shared_friction(self.robot, self._estimate, self._grip)
+        told = shared_friction(self.robot, self._tests.beside(self._estimate), self._grip)
         grip = JointState(name=list(self.robot.caster_names))
         grip.header.stamp = measured.header.stamp
         fill_joint_state(grip, position=told.lambda_p, effort=told.mu_p)
@@ -241,7 +266,7 @@ class TerrainNode(Node):
     def _status(self) -> Status:
         values: dict[str, object] = {"gaps": self._watch.gaps, "repeated_stamps": self._watch.repeats}
         values |= {"backward_jumps": self._watch.backward_jumps, "unusable_joint_states": self._unusable}
-        values |= {"known_cells": self._map.known}
+        values |= {"known_cells": self._map.known, "known_by_tests": int(self._tests.known.sum())}
         problems, estimate = self._problems.take(), self._estimate
         if estimate is not None and estimate.valid.any():
             values |= {
