@@ -31,7 +31,7 @@ AT_REST = np.zeros((4, 2))
 class Loop:
     """A robot that follows a twist by a controller, and, from a request on, the path of that twist by its odometry."""
 
-    def __init__(self, controller="computed_torque", seed=0, replay=5, twist=TWIST):
+    def __init__(self, controller="computed_torque", seed=0, replay=5, twist=TWIST, late=0):
         inner = make_plant("reduced", on_ground(THESIS, MU, CRITICAL))
         inner.reset(steer_angle=np.zeros(4))
         self.simulated, self.twist = SimulatedRobot(inner, seed), twist
@@ -42,7 +42,7 @@ class Loop:
         self.state, self.odometry = self.test.initial_state(), odometry.initial_state()
         self.torque = self.asked = AT_REST
         self.path, self.begun, self.before, self.output = None, 0.0, -1, None
-        self.errors = []
+        self.errors, self.waiting = [], late * [AT_REST]  # torques that have not arrived yet
 
     @property
     def now(self):
@@ -67,7 +67,8 @@ class Loop:
         self.asked = wanted.torque
         limited = limit_torque(self.limits, self.torque, self.asked + self.output.torque, reading.velocity, dt)
         self.torque = limited.torque
-        self.simulated.command(JointCommand(effort=self.torque))
+        self.waiting.append(self.torque)
+        self.simulated.command(JointCommand(effort=self.waiting.pop(0)))
         if self.path is not None:
             self.errors.append(self.simulated.plant.state().pose - self.truth.sample(self.now - self.begun).pose)
 
@@ -104,6 +105,21 @@ def test_the_ground_is_found_with_every_controller_that_it_is_said_to_work_with(
     assert np.median(np.abs(ground.lambda_p / CRITICAL - 1.0)) < 0.12
     way = np.hypot(*np.array(loop.errors)[:, :2].T).max()
     assert way <= 0.004 and way <= forecast.path
+
+
+@pytest.mark.parametrize("late", [2, *(pytest.param(late, marks=pytest.mark.nightly) for late in (3, 4))])
+def test_torques_may_come_as_late_as_is_said(late):
+    """By 2 ms each; from four on controller, tyres and observer shake each other: the test ends before the path is lost."""
+    loop = Loop(late=late).under_way()
+    loop.request()
+    loop.until(lambda: not loop.state.busy)
+    ground = loop.state.ground
+    if late > 3:
+        assert loop.state.testing.refusal is Refusal.OTHERS_SLIP and not ground.valid.any()
+    else:
+        assert ground.valid.all() and np.abs(ground.mu_p / MU - 1.0).max() < 0.05
+        assert np.abs(ground.lambda_p / CRITICAL - 1.0).max() < (0.03 if late == 2 else 0.2)
+    assert np.hypot(*np.array(loop.errors)[:, :2].T).max() <= 0.005
 
 
 def test_going_over_a_test_a_few_readings_at_a_time_finds_the_very_same():

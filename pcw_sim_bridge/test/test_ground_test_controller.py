@@ -14,12 +14,13 @@ from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
-from pcw_description.nodes.node_tools import LATCHED, stamp_to_ns  # noqa: E402
+from pcw_description.nodes.node_tools import LATCHED, ns_to_stamp, stamp_to_ns  # noqa: E402
 from pcw_description.robot_file import save_robot  # noqa: E402
 from pcw_sim_bridge.terrain_study import on_ground  # noqa: E402
 
@@ -35,7 +36,8 @@ class Drive:
 
     def __init__(self, ros):
         self.ros, self.speed, self.torque = ros, None, np.zeros((4, 2))
-        self.truth = []
+        self.truth, self.ahead_ns = [], 0
+        self.clock = ros.peer.create_publisher(Clock, "test_clock", 1)
         self.tested = ros.listen(JointState, "terrain/tested", LATCHED)
         self.diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
         self.cmd_vel = ros.peer.create_publisher(TwistStamped, "cmd_vel", 1)
@@ -44,6 +46,7 @@ class Drive:
 
     def _on_truth(self, message):
         self.truth.append(message)
+        self.clock.publish(Clock(clock=ns_to_stamp(stamp_to_ns(message.header.stamp) + self.ahead_ns)))
         if len(self.truth) % 5 == 0 and self.speed is not None:
             command = TwistStamped()
             command.twist.linear.x = self.speed
@@ -100,7 +103,7 @@ def drive(tmp_path):
         # On a busy machine an answer may take its time, and the plant waits for it.
         ros.start(
             "pcw_sim_bridge.nodes.ground_test_controller", "-p", "cmd_vel_timeout:=2.0", "-p", "joint_states_timeout:=30.0",
-            "-p", "ground_test.replay:=20",
+            "-p", "ground_test.replay:=20", "-p", "use_sim_time:=true", "-r", "/clock:=/test_clock",
         )  # fmt: skip
         ros.start(
             "pcw_sim_bridge.nodes.bridge", "-p", f"robot:={tmp_path / 'real.yaml'}", "-p", "lockstep:=true",
@@ -162,6 +165,16 @@ def test_cancelled_and_changed_requests_bring_the_wheel_back(drive):
     drive.ros.wait_for(lambda: abs(drive.speed_now()) < 0.005)
     standing = drive.ask()
     assert not standing.success and "too slow" in standing.message
+
+
+def test_answers_that_come_late_cancel_the_test(drive):
+    """By the node's clock, which this test sets forward."""
+    drive.under_way()
+    assert drive.ask().success
+    drive.first_slips()
+    drive.ahead_ns = 50_000_000
+    late = drive.ros.wait_for(lambda: drive.says("ground test", "ms old as they are answered"))
+    assert late.message.startswith("ended: joint_states are")
 
 
 def test_nothing_is_added_after_deactivation(drive):

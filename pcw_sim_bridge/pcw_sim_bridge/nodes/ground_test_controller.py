@@ -33,6 +33,8 @@ from .ground_test_messages import caster_parts, test_status
 SAME_TWIST = np.array([0.01, 0.01, 0.02])
 # Times `ground_test.greatest_path` off its path, by odometry, at which a test is cancelled [1].
 STRAYED = 2.0
+# Stamps that are further from the node's clock are of another one [s].
+OTHER_CLOCK = 1.0
 # For which the path is held after the last test, so that the robot is back on it [s].
 AFTERWARDS = 0.4
 
@@ -60,7 +62,11 @@ class GroundTestControllerNode(ControllerNode):
             "a caster is not tested where the base would leave its path further", "m", (0.001, 0.1),
         )
         declare(
-            self, "ground_test.replay", 5, "readings of a finished test that are gone over in one cycle", "1", (1, 10000)
+            self, "ground_test.greatest_delay", 0.006, "a test is cancelled where joint_states are older as they are answered",
+            "s", (0.001, 0.1),
+        )
+        declare(
+            self, "ground_test.replay", 3, "readings of a finished test that are gone over in one cycle", "1", (1, 10000)
         )
 
     def _adopt_parameters(self) -> None:
@@ -193,6 +199,7 @@ class GroundTestControllerNode(ControllerNode):
             self._state_of_test = self._test.drop(self._state_of_test)
             return self._test.seen(self._state_of_test, position), velocity
         self._unusable, self._added = "", output.torque
+        self._note_delay()
         if before.under_test >= 0:
             self._slipped_ns = self._now_ns
         if output.found >= 0:
@@ -201,6 +208,12 @@ class GroundTestControllerNode(ControllerNode):
         if before.busy and not self._state_of_test.busy:
             self._say_ended()
         return output.position, output.velocity
+
+    def _note_delay(self) -> None:
+        """Cancel where answers come too late, so that controller, tyres and observer would shake each other."""
+        delay = (self.get_clock().now().nanoseconds - self._now_ns) * 1e-9
+        if self.get_parameter("ground_test.greatest_delay").value < delay < OTHER_CLOCK:
+            self._cancel(f"joint_states are {1e3 * delay:.0f} ms old as they are answered")
 
     def _reference(self, hazards: set[str]) -> Reference | None:
         """Return the path on which the robot is held while it is tested, as long as the same cmd_vel is followed."""
