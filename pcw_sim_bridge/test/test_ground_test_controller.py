@@ -189,6 +189,23 @@ def test_nothing_is_added_after_deactivation(drive):
     assert not answer.success and answer.message == "not active"
 
 
+def test_a_jump_of_the_stamps_and_a_command_that_falls_silent_end_the_test(drive):
+    drive.under_way()
+    assert drive.ask().success
+    drive.first_slips()
+    assert drive.ask("bridge/reset").success
+    drive.ros.wait_for(lambda: drive.says("ground test", "ended: no time step"))
+    drive.ros.wait_for(lambda: abs(drive.speed_now()) < 0.1)
+    drive.under_way()
+    assert drive.ask().success
+    drive.first_slips()
+    drive.speed = None
+    drive.ros.wait_for(lambda: drive.says("ground test", "ended: no cmd_vel within cmd_vel_timeout"))
+    drive.ros.wait_for(lambda: not drive.torque.any())
+    answer = drive.ask()
+    assert not answer.success and "follows no cmd_vel" in answer.message
+
+
 def test_another_controller_ends_the_test(drive):
     """Nothing is added to the new one's torques, and what was added to the old one's is not handed over."""
     drive.under_way()

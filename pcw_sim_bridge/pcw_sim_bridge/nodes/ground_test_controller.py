@@ -71,9 +71,10 @@ class GroundTestControllerNode(ControllerNode):
 
     def _adopt_parameters(self) -> None:
         super()._adopt_parameters()
+        self._greatest_path: float = self.get_parameter("ground_test.greatest_path").value
+        self._greatest_delay: float = self.get_parameter("ground_test.greatest_delay").value
         active = ActiveParameters(
-            stiffness=float(getattr(self._controller.parameters, "position_gain", 0.0)),
-            greatest_path=self.get_parameter("ground_test.greatest_path").value,
+            stiffness=float(getattr(self._controller.parameters, "position_gain", 0.0)), greatest_path=self._greatest_path
         )
         parameters = GroundTestParameters(
             self.get_parameter("ground_test.measured").value, self.get_parameter("ground_test.replay").value, active
@@ -143,7 +144,7 @@ class GroundTestControllerNode(ControllerNode):
             return f"controller = {self._name!r} is not allowed; allowed: {', '.join(WORKS_WITH)}", None
         if not self._driving or self._twist is None:
             return "the robot follows no cmd_vel; allowed: while it follows a steady one", None
-        if self._passed.latched or np.any(np.abs(self._twist - self._reference_twist) > SAME_TWIST):
+        if np.any(np.abs(self._twist - self._reference_twist) > SAME_TWIST):
             return f"cmd_vel {self._twist.tolist()} is not reached yet; allowed: while a steady one is followed", None
         forecast = None if self._unusable else self._test.forecast(self._state_of_test)
         if forecast is None:
@@ -204,7 +205,8 @@ class GroundTestControllerNode(ControllerNode):
             self._slipped_ns = self._now_ns
         if output.found >= 0:
             self._odometry = shifted(self._odometry, output.missed)
-            self._publish_tested()
+            if self._state_of_test.ground.valid[output.found]:
+                self._publish_tested()
         if before.busy and not self._state_of_test.busy:
             self._say_ended()
         return output.position, output.velocity
@@ -212,7 +214,7 @@ class GroundTestControllerNode(ControllerNode):
     def _note_delay(self) -> None:
         """Cancel where answers come too late, so that controller, tyres and observer would shake each other."""
         delay = (self.get_clock().now().nanoseconds - self._now_ns) * 1e-9
-        if self.get_parameter("ground_test.greatest_delay").value < delay < OTHER_CLOCK:
+        if self._greatest_delay < delay < OTHER_CLOCK:
             self._cancel(f"joint_states are {1e3 * delay:.0f} ms old as they are answered")
 
     def _reference(self, hazards: set[str]) -> Reference | None:
@@ -233,7 +235,7 @@ class GroundTestControllerNode(ControllerNode):
     def _note_disturbance(self, point: TrajectoryPoint) -> None:
         x, y, yaw = self._odometry.pose - point.pose
         self._disturbance = np.maximum(self._disturbance, [np.hypot(x, y), abs(yaw)])
-        if self._disturbance[0] > STRAYED * self.get_parameter("ground_test.greatest_path").value:
+        if self._disturbance[0] > STRAYED * self._greatest_path:
             self._cancel(f"the base has left its path by {1e3 * self._disturbance[0]:.1f} mm")
 
     def _with_more(self, torque: np.ndarray) -> np.ndarray:
