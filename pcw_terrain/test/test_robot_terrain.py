@@ -15,6 +15,7 @@ from pcw_terrain import (
     ActiveIdentification,
     ActiveMeasurement,
     ActiveParameters,
+    ActiveRecord,
     Phase,
     Refusal,
     RobotReading,
@@ -331,3 +332,19 @@ def test_others_take_the_force_whatever_the_headings(speed, heading, caster):
     others = active._others(A, caster, force)
     rows = np.delete(np.arange(8), [2 * caster, 2 * caster + 1])
     np.testing.assert_allclose(A[rows].T @ others.ravel(), -A[2 * caster : 2 * caster + 2].T @ force, atol=1e-9)
+
+
+def test_a_record_of_nothing_is_refused():
+    record = ActiveRecord(RobotTerrain(THESIS), ActiveIdentification(THESIS))
+    for evaluate in (record.begin, record.identify):
+        with pytest.raises(TerrainError, match="a record of 0 cycles is not allowed; allowed: at least 1"):
+            evaluate(0)
+
+
+def test_what_is_asked_for_or_goes_on_is_dropped_and_what_is_over_stays_as_it_is():
+    active = ActiveIdentification(THESIS)
+    idle = active.initial_state()
+    assert active.drop(idle) is idle
+    dropped = active.drop(active.request(idle))
+    assert dropped.phase is Phase.REFUSED and dropped.refusal is Refusal.CANCELLED and dropped.queue == ()
+    assert active.drop(dropped) is dropped
