@@ -33,6 +33,8 @@ from .ground_test_messages import caster_parts, test_status
 SAME_TWIST = np.array([0.01, 0.01, 0.02])
 # Times `ground_test.greatest_path` off its path, by odometry, at which a test is cancelled [1].
 STRAYED = 2.0
+# So many joint_states in a row are answered late before a test is cancelled for it.
+LATE = 5
 # Stamps that are further from the node's clock are of another one [s].
 OTHER_CLOCK = 1.0
 # For which the path is held after the last test, so that the robot is back on it [s].
@@ -62,11 +64,11 @@ class GroundTestControllerNode(ControllerNode):
             "a caster is not tested where the base would leave its path further", "m", (0.001, 0.1),
         )
         declare(
-            self, "ground_test.greatest_delay", 0.006, "a test is cancelled where joint_states are older as they are answered",
-            "s", (0.001, 0.1),
+            self, "ground_test.greatest_delay", 0.006,
+            "a test is cancelled where five joint_states in a row are older as they are answered", "s", (0.001, 0.1),
         )
         declare(
-            self, "ground_test.replay", 3, "readings of a finished test that are gone over in one cycle", "1", (1, 10000)
+            self, "ground_test.replay", 2, "readings of a finished test that are gone over in one cycle", "1", (1, 10000)
         )
 
     def _adopt_parameters(self) -> None:
@@ -94,7 +96,7 @@ class GroundTestControllerNode(ControllerNode):
         self._state_of_test = self._test.initial_state()
         self._asked = self._added = np.zeros((self.robot.n, 2))
         self._held: SteadyPath | None = None
-        self._held_ns = self._ended_ns = self._slipped_ns = 0
+        self._held_ns = self._ended_ns = self._slipped_ns = self._late = 0
         self._ended, self._unusable = "", "there were no joint_states"
         self._forecast: Forecast | None = None
         self._disturbance = np.zeros(2)  # way [m] and turn [rad] off the path, by odometry
@@ -214,7 +216,8 @@ class GroundTestControllerNode(ControllerNode):
     def _note_delay(self) -> None:
         """Cancel where answers come too late, so that controller, tyres and observer would shake each other."""
         delay = (self.get_clock().now().nanoseconds - self._now_ns) * 1e-9
-        if self._greatest_delay < delay < OTHER_CLOCK:
+        self._late = self._late + 1 if self._greatest_delay < delay < OTHER_CLOCK else 0
+        if self._late >= LATE:
             self._cancel(f"joint_states are {1e3 * delay:.0f} ms old as they are answered")
 
     def _reference(self, hazards: set[str]) -> Reference | None:
