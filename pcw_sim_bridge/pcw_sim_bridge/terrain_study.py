@@ -37,7 +37,7 @@ from .simulated_robot import JointCommand, SimulatedRobot
 
 SPEED, UNDER_WAY, REQUESTED = 0.3, 1.0, 1.5  # [m/s], until it moves steadily [s], when slip is asked for [s]
 LONGEST, AFTERWARDS = 8.0, 0.4  # of a run, and after the last test [s]
-ROBOT = "thesis"
+ROBOT, OTHER_ROBOTS = "thesis", ("xr4000", "flow_base")
 
 
 def on_ground(robot: RobotDescription, mu_p: float, lambda_p: float) -> RobotDescription:
@@ -159,6 +159,22 @@ def random_ground(seed: int) -> tuple[float, float]:
     return float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.06, 0.18))
 
 
+def random_heading(seed: int) -> float:
+    """Return a direction to drive in [rad]."""
+    return float(np.random.default_rng([seed, 59]).uniform(-np.pi, np.pi))
+
+
+def with_one_elsewhere(robot: RobotDescription, seed: int) -> tuple[RobotDescription, list[tuple[float, float]]]:
+    """Return a robot one wheel of which stands on another ground, half as good to twice, and mu_p, lambda_p per caster."""
+    rng = np.random.default_rng([seed, 61])
+    ground, caster = random_ground(seed), int(rng.integers(robot.n))
+    other = (float(min(ground[0] * 2.0 ** rng.uniform(-1.0, 1.0), 0.8)), float(rng.uniform(0.06, 0.18)))
+    real = on_ground(robot, *ground).with_tyres(
+        [robot.caster_names[caster]], lambda tyre: on_ground(dataclasses.replace(robot, contact=tyre), *other).contact
+    )
+    return real, [other if i == caster else ground for i in range(robot.n)]
+
+
 @dataclasses.dataclass(frozen=True)
 class ActiveSummary:
     """Many runs; errors are relative, of all casters of all runs that gave a valid estimate."""
@@ -178,11 +194,12 @@ class ActiveSummary:
     refusals: tuple[str, ...]
 
 
-def summarise(grounds: Sequence[tuple[float, float]], runs: Sequence[ActiveRun]) -> ActiveSummary:
-    """Return the figures of runs on these grounds."""
+def summarise(grounds: Sequence[Sequence[tuple[float, float]]], runs: Sequence[ActiveRun]) -> ActiveSummary:
+    """Return the figures of runs on these grounds, mu_p and lambda_p under each caster."""
     mu, critical, spread = [], [], []
-    for (mu_p, lambda_p), run in zip(grounds, runs, strict=True):
+    for ground, run in zip(grounds, runs, strict=True):
         for index in np.nonzero(run.valid)[0]:
+            mu_p, lambda_p = ground[int(index)]
             mu.append(np.log(run.mu_p[index] / mu_p))
             critical.append(np.log(run.lambda_p[index] / lambda_p))
             spread.append(np.sqrt(np.diag(run.covariance[index])))
@@ -197,46 +214,50 @@ def summarise(grounds: Sequence[tuple[float, float]], runs: Sequence[ActiveRun])
     )  # fmt: skip
 
 
+def _rows(plants: Sequence[str]) -> list[tuple[str, str, str, bool]]:
+    """Robot, plant, what is measured, and whether one wheel stands elsewhere."""
+    rows = [(ROBOT, plant, measured, False) for plant in plants for measured in ("angle", "speed")]
+    return rows + [(name, plants[0], "angle", False) for name in OTHER_ROBOTS] + [(ROBOT, plants[0], "angle", True)]
+
+
 def document(plants: Sequence[str], seeds: range) -> str:
     """Return the text of terrain_robot.md."""
-    believed = load_robot(ROBOT)
     parts = [
         "# Terrain of whole robots",
         "",
         f"Written by `python -m pcw_sim_bridge.terrain_study --seeds {len(seeds)} --first-seed {seeds.start} --plants "
         f"{' '.join(plants)}`; nothing here is typed in.",
         "",
-        f"The `{ROBOT}` robot follows a straight line at {SPEED:g} m/s and is asked to identify the ground "
-        "under every caster by "
-        "letting one after the other slip. mu_p is drawn from 0.3 to 0.8 and lambda_p from 0.06 to 0.18; everything that "
-        "computes believes in 0.8 and 0.1 at first. `angle`: joint angles and motor torques are all that observer and "
-        "identification are given. The path's error is that of base_link against its line, along and across "
-        "together, from the "
-        "request until after the last test.",
+        f"A robot follows a straight line at {SPEED:g} m/s in a direction drawn at random, its wheels turned that way, and is "
+        "asked to identify the ground under every caster by letting one after the other slip. mu_p is drawn from 0.3 to 0.8 "
+        "and lambda_p from 0.06 to 0.18; everything that computes believes in the robot file's, 0.8 and 0.1, at first. "
+        "`angle`: joint angles and motor torques are all that observer and identification are given. Ground `one elsewhere`: "
+        "one wheel stands on another one, half as good to twice. The path's error is that of base_link against its line, "
+        "along and across together, from the request until after the last test.",
         "",
-        "| plant | measured | tests | valid | mu_p: median error | worst | lambda_p: median | worst | 95 % "
-        "intervals hold mu_p, "
-        "lambda_p | slowest, all casters | path: median | worst | yaw, worst | path predicted, one test | ended early |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| robot | plant | ground | measured | tests | valid | mu_p: median error | worst | lambda_p: median | worst | 95 % "
+        "intervals hold mu_p, lambda_p | slowest, all casters | path: median | worst | yaw, worst | path predicted, one test "
+        "| ended early |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for plant in plants:
-        for measured in ("angle", "speed"):
-            grounds = [random_ground(seed) for seed in seeds]
-            started = time.perf_counter()
-            runs = [
-                active_run(on_ground(believed, *ground), believed, plant, seed, measured)
-                for seed, ground in zip(seeds, grounds, strict=True)
-            ]
-            s = summarise(grounds, runs)
-            parts.append(
-                f"| {plant} | {measured} | {s.tests} | {s.valid} | {s.mu_median:.1%} | {s.mu_worst:.1%} | "
-                f"{s.lambda_median:.1%} | "
-                f"{s.lambda_worst:.1%} | {s.covered[0]:.0%}, {s.covered[1]:.0%} | {s.slowest:.2f} s | "
-                f"{1e3 * s.path_median:.1f} mm | "
-                f"{1e3 * s.path_worst:.1f} mm | {1e3 * s.yaw_worst:.1f} mrad | {1e3 * s.predicted:.1f} mm | "
-                f"{'; '.join(sorted(set(s.refusals))) or '-'} |"
-            )
-            print(parts[-1], f"({time.perf_counter() - started:.0f} s)", flush=True)
+    for name, plant, measured, split in _rows(plants):
+        started, believed = time.perf_counter(), load_robot(name)
+        grounds, runs = [], []
+        for seed in seeds:
+            real, ground = on_ground(believed, *random_ground(seed)), [random_ground(seed)] * believed.n
+            if split:
+                real, ground = with_one_elsewhere(believed, seed)
+            grounds.append(ground)
+            runs.append(active_run(real, believed, plant, seed, measured, random_heading(seed)))
+        s = summarise(grounds, runs)
+        ended = [f"{reason} ({s.refusals.count(reason)} runs)" for reason in sorted(set(s.refusals))]
+        parts.append(
+            f"| {name} | {plant} | {'one elsewhere' if split else 'one'} | {measured} | {s.tests} | {s.valid} | "
+            f"{s.mu_median:.1%} | {s.mu_worst:.1%} | {s.lambda_median:.1%} | {s.lambda_worst:.1%} | {s.covered[0]:.0%}, "
+            f"{s.covered[1]:.0%} | {s.slowest:.2f} s | {1e3 * s.path_median:.1f} mm | {1e3 * s.path_worst:.1f} mm | "
+            f"{1e3 * s.yaw_worst:.1f} mrad | {1e3 * s.predicted:.1f} mm | {'; '.join(ended) or '-'} |"
+        )
+        print(parts[-1], f"({time.perf_counter() - started:.0f} s)", flush=True)
     parts += [
         "",
         "A test needs a motor that can take its wheel past the ground's hold: the drives of `tidybot2` and "

@@ -2,11 +2,13 @@
 
 2n - 3 of the 2n contact forces are internal: they lie in the null space of A^T and do not move the robot, A^T dF = 0 (5.3)
 [Li2009]. The caster under test is held at a slip ratio that grows from little to much; what the ground gives it, F_i, is more
-than the controller asked of it, F_i,ct, and the others take the rest with the least forces,
+than the controller asked of it, F_i,ct, and the others take the rest, so that no wheel comes near what it can hold,
 
-    dF_others = -(A_others^T)^+ a_i (F_i - F_i,ct),        so that  A^T dF = 0,        d_tau = B^T dF.
+    min max_j |dF_j| / (mu_p F_N)_j     where     A_others^T dF_others = -a_i (F_i - F_i,ct),     so that A^T dF = 0,
 
-The increment d_tau is added to the controller's torque. The controller must not take the slipping wheel for motion: instead of
+and d_tau = B^T dF.
+
+The increment is added to the controller's torque. The controller must not take the slipping wheel for motion: instead of
 the joints that are measured it is given those of wheels that roll (`controller_position`, `controller_velocity`). The others
 creep under the forces they take, by the lower root of mu(lambda); where the ground is not known, as much as the first slip of
 the test tells. It is taken off too, and casters are driven or braked so that what is left of it cancels out.
@@ -45,6 +47,9 @@ LEAST_SHARE = 0.25
 CREEP_SLIP, LEAST_CREEP = 0.04, 0.01
 # How much more a turn counts than a way, at the place of the outermost caster.
 TURNING_WEIGHT = 3.0
+# Part of what the wheel that holds most can hold, as which one counts that holds next to nothing [1]. How often forces are
+# shared anew among the others.
+LEAST_HOLD, SHARINGS = 1e-3, 4
 # A slip ratio that is commanded is no larger than this [1].
 GREATEST_LEAD = 0.7
 
@@ -296,7 +301,8 @@ class ActiveIdentification:
     def request(self, state: ActiveState, casters: tuple[int, ...] | None = None) -> ActiveState:
         """Return the state with the test of some casters, all by default, asked for.
 
-        One that cannot be tested as the robot stands and drives is left out, with its reason in `refused`; the others follow.
+        One that cannot be tested as the robot stands and drives waits until the others have been, which tell of the ground; if
+        it cannot be tested then either it is left out, with its reason in `refused`.
 
         Raises:
             TerrainError: a caster that the robot does not have.
@@ -356,7 +362,7 @@ class ActiveIdentification:
         mu = p.assumed_friction if mu_p is None else mu_p
         A = wheel_jacobian_kernel(self.robot.steer_axis, self.robot.caster_offset, np.ascontiguousarray(steer_angle))
         force = np.array([mu * float(normal_force[caster]), 0.0])
-        others = self._others(A, caster, force)
+        others = self._others(A, caster, force, normal_force)
         left = p.force_error * (A[2 * caster : 2 * caster + 2].T @ force)
         mass = self.robot.total_mass
         reach = float(np.mean(np.sum(self.robot.steer_axis**2, axis=1)))
@@ -409,10 +415,13 @@ class ActiveIdentification:
 
     def _begin(self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> ActiveState:
         refusal = state.refusal if state.refusal is Refusal.CANCELLED else self._unsafe(state.queue[0], m, A, twist)
+        before = tuple(entry for entry in state.refused if entry[0] != state.queue[0])
         if refusal in OF_ONE_CASTER:
-            refused = (*state.refused, (state.queue[0], refusal))
-            if len(state.queue) > 1:
-                return dataclasses.replace(state, queue=state.queue[1:], refused=refused)
+            refused = (*before, (state.queue[0], refusal))
+            # Once the others have told of the ground more may be possible.
+            again = state.queue[:1] if len(before) == len(state.refused) else ()
+            if queue := (*state.queue[1:], *again):
+                return dataclasses.replace(state, queue=queue, refused=refused)
             phase = Phase.DONE if state.tested else Phase.REFUSED
             return dataclasses.replace(state, phase=phase, queue=(), elapsed=0.0, refusal=refusal, refused=refused)
         if refusal is not Refusal.NONE:
@@ -434,6 +443,7 @@ class ActiveIdentification:
             backwards=backwards,
             spent=spent,
             tested=(*state.tested, state.queue[0]),
+            refused=before,
         )
 
     def _unsafe(self, caster: int, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> Refusal:
@@ -451,7 +461,7 @@ class ActiveIdentification:
         loads, mu_p = m.normal_force, float(m.mu_p[caster])
         if self.predict(np.ascontiguousarray(m.position[:, STEER]), caster, loads, mu_p).path > p.greatest_path:
             return Refusal.DISTURBANCE
-        others = self._others(A, caster, force)
+        others = self._others(A, caster, force, m.mu_p * m.normal_force)
         index = np.delete(np.arange(self.n), caster)
         use = np.linalg.norm(others, axis=1) / np.maximum(m.mu_p[index] * m.normal_force[index], 1e-9)
         return Refusal.OTHERS_NEAR_LIMIT if use.max() > p.others_use else Refusal.NONE
@@ -501,7 +511,7 @@ class ActiveIdentification:
         torque[testing, DRIVE] = gain * error + integral + carried - m.controller_torque[testing, DRIVE]
         asked = self._B_inverse[testing].T @ m.controller_torque[testing]
         more = np.array([float(m.force[testing, 0]) - asked[0], 0.0])
-        others = self._others(A, testing, more)
+        others = self._others(A, testing, more, m.mu_p * m.normal_force)
         index = np.delete(np.arange(self.n), testing)
         torque[index] = np.einsum("nji,nj->ni", self._B[index], others)
         force = np.zeros((self.n, 2))
@@ -531,13 +541,23 @@ class ActiveIdentification:
     def _ended(state: ActiveState, refusal: Refusal) -> ActiveState:
         return dataclasses.replace(state, phase=Phase.RETURN, elapsed=0.0, refusal=refusal)
 
-    def _others(self, A: FloatArray, caster: int, force: FloatArray) -> FloatArray:
-        """Return the least forces of the others (n - 1, 2) [N] that leave no wrench with `force` (2,) of a caster."""
+    def _others(self, A: FloatArray, caster: int, force: FloatArray, hold: FloatArray) -> FloatArray:
+        """Return the forces of the others (n - 1, 2) [N] that leave no wrench with `force` (2,) of a caster.
+
+        Those of which the greatest is least, in proportion to what each wheel can hold, `hold` (n,): least squares with
+        weights that grow with what each takes (Lawson, 1961), a few times over.
+        """
         rows = np.ones(2 * self.n, dtype=bool)
         rows[2 * caster : 2 * caster + 2] = False
         wrench = A[2 * caster : 2 * caster + 2].T @ force
-        rest = A[rows]
-        return -(rest @ np.linalg.solve(rest.T @ rest, wrench)).reshape(-1, 2)
+        rest, hold = A[rows], np.delete(np.maximum(hold, LEAST_HOLD * hold.max()), caster)
+        weight, others = np.ones(self.n - 1), np.zeros((self.n - 1, 2))
+        for _ in range(SHARINGS):
+            give = np.repeat(hold**2 / weight, 2)[:, None]
+            others = -(give * rest @ np.linalg.solve(rest.T @ (give * rest), wrench)).reshape(-1, 2)
+            weight *= np.linalg.norm(others, axis=1) / hold
+            weight = np.maximum(weight / max(float(weight.max()), 1e-300), LEAST_HOLD)
+        return others
 
     def _learn_creep(
         self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, sensed: FloatArray, testing: int, velocity: float,
