@@ -131,7 +131,7 @@ class GroundTestControllerNode(ControllerNode):
             names = self.robot.caster_names
             said = f"{', '.join(names[i] for i in forecast.begins)} will slip one after another"
             said += f"; the base is expected to leave its path by up to {1e3 * forecast.path:.1f} mm"
-            left_out = (f"; {names[i]} is left out: {why.value}" for i, why in forecast.left_out)
+            left_out = (f"; {names[i]} may be left out: {why.value}" for i, why in forecast.left_out)
             response.message = said + "".join(left_out)
         return response
 
