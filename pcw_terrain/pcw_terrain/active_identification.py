@@ -348,7 +348,7 @@ class ActiveIdentification:
         p = self.parameters
         asked = dataclasses.replace(self.request(state, (caster,)), elapsed=p.rest_time)
         after, _ = self.step(asked, measurement, 1e-6)
-        return Refusal.NONE if after.phase is Phase.SLIP else after.refusal
+        return Refusal.NONE if after.phase is Phase.SLIP else dict(after.refused).get(caster, after.refusal)
 
     def predict(
         self, steer_angle: FloatArray, caster: int, normal_force: FloatArray, mu_p: float | None = None
