@@ -152,9 +152,12 @@ def _merged(table: MessageTable, joints: _JointTable, t0_ns: int | None) -> tupl
         if rows is main or not len(rows):
             continue
         own_stamp = (table.stamp_ns[rows] - stamp_ns[0]) * 1e-9
+        nearest = np.searchsorted(0.5 * (own_stamp[1:] + own_stamp[:-1]), stamp)
         for column in np.flatnonzero(joints.present[rows].any(axis=0)):
-            for kind in range(len(FIELDS)):
+            for kind in (POSITION, VELOCITY):
                 values[kind, :, column] = np.interp(stamp, own_stamp, joints.values[kind, rows, column])
+            # A motor holds its torque from one command to the next: between two readings there is none like either.
+            values[EFFORT, :, column] = joints.values[EFFORT, rows[nearest], column]
     return stamp_ns, values
 
 
@@ -174,8 +177,8 @@ def _streams(table: MessageTable, joints: _JointTable) -> list[RowArray]:
     patterns, pattern_of = np.unique(present, axis=0, return_inverse=True)
     if (patterns.sum(axis=0) == 1).all():
         text = (
-            f"the joints come in {len(patterns)} separate messages; brought to the stamps of one of them by linear "
-            "interpolation"
+            f"the joints come in {len(patterns)} separate messages; brought to the stamps of one of them, efforts those of "
+            "the nearest and the rest by linear interpolation"
         )
         table.warn("split_message", text, len(patterns))
         # numpy 2.0 alone gives the inverse two dimensions

@@ -923,6 +923,15 @@ def test_joints_in_separate_messages_are_brought_together(robot: RobotDescriptio
     np.testing.assert_allclose(states.position, healthy.position, atol=largest)
 
 
+def test_efforts_in_separate_messages_are_those_of_the_nearest(robot: RobotDescription, tmp_path: Path) -> None:
+    """Interpolated between two commands that a motor had held, they seemed to follow late: a dead time of all drives."""
+    healthy = drive(robot)
+    rng = np.random.default_rng(1)
+    healthy = dataclasses.replace(healthy, effort=rng.standard_normal(healthy.effort.shape))
+    path = write_parts(tmp_path / "bag", healthy, lambda row: [[2 * i, 2 * i + 1] for i in range(robot.n)])
+    np.testing.assert_array_equal(Recording.open(path, robot).joint_states.effort[1:-1], healthy.effort[1:-1])
+
+
 def test_a_few_incomplete_messages_are_left_out(robot: RobotDescription, tmp_path: Path) -> None:
     healthy = drive(robot)
     path = write_parts(
