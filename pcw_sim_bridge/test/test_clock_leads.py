@@ -13,6 +13,7 @@ from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.clock_leads import FIRST_ORDER, clock_leads
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, wheels_slide
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 from pcw_sim_bridge.simulated_run import record_run
 
@@ -48,6 +49,37 @@ def test_leads_are_found_where_first_orders_say_nothing_of_them(tmp_path: Path, 
     assert 0.01 < least < 0.1
     assert leads == pytest.approx(wanted, abs=0.015)
     assert [lead == 0.0 for lead in leads] == [lead == 0.0 for lead in wanted]
+
+
+@pytest.mark.parametrize("late", [0.06, 0.0])
+def test_a_slow_and_coarse_tracker_is_found_late(tmp_path: Path, late: float) -> None:
+    """The velocity of a camera is mostly noise: 60 ms came out at 2 to 20 ms, with intervals of a few."""
+    recording = Recording.open(recorded(tmp_path / "run", 0.0, 0.0, 4, 30.0), THESIS)
+    truth = recording.ground_truth
+    assert truth is not None
+    rng = np.random.default_rng(5)
+    pose = truth.pose[::3] + np.array([2e-3, 2e-3, 4e-3]) * rng.standard_normal((len(truth.pose[::3]), 3))
+    stamp = truth.stamp[::3] + late + 2e-3 * rng.standard_normal(len(pose))
+    recording.ground_truth = dataclasses.replace(
+        truth, **{f.name: getattr(truth, f.name)[::3] for f in dataclasses.fields(truth) if f.name not in ("stamp", "pose")},
+        stamp=stamp, pose=pose,
+    )  # fmt: skip
+    builder = RobotProblemBuilder(THESIS, [recording])
+    leads = clock_leads(builder.motions, builder.numbers, [np.zeros(len(m.time), dtype=bool) for m in builder.motions])
+    assert leads == pytest.approx([0.0, late], abs=0.015)
+
+
+def test_what_the_fitted_recordings_say_of_the_clocks_holds_for_held_out_ones(tmp_path: Path) -> None:
+    """Too slow a motion to show it was taken to have no lead, and its columns, all noise, spoke against it."""
+    subject = RobotSubject(THESIS)
+    fit, other = (
+        [subject.open(recorded(tmp_path / name, 0.0, lead, seed, 16.0), role, {})]
+        for name, lead, seed, role in (("fit", 0.3, 6, "fit"), ("other", 0.0, 7, "holdout"))
+    )
+    subject.problem(fit)
+    held_out = subject.problem_with(other)(["clock_offset/clock"])
+    (clock,) = (term for term in held_out.terms if term.effect == "clock_offset")
+    assert clock.is_exact
 
 
 def test_a_robot_behind_wheels_that_spin_has_no_late_tracker(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import signal
+from scipy import ndimage, signal
 
 from .regression_problem import BoolArray, FloatArray
 from .robot_motion import RobotMotion
@@ -20,6 +20,9 @@ from .signal_filter import derivative
 LONGEST_LEAD = 1.0  # [s], either way
 FIRST_ORDER = 0.5  # periods of the fastest that motions hold; first orders tell of a shorter lead
 CLEARLY = 0.7  # of what a sensor has besides the motion of the wheels a shift leaves at most so much
+# Motions are compared as they are and as means over these times [s]: of the velocity of a tracker that is slow or coarse most
+# is noise, which hides what a shift does.
+SMOOTHINGS = (0.0, 0.1, 0.3)
 SHORTEST_PIECE = 4.0 * LONGEST_LEAD  # [s]; of a shorter one too little is left beside such a shift
 
 
@@ -45,26 +48,39 @@ def clock_leads(motions: Sequence[RobotMotion], numbers: ModelNumbers, sliding: 
 
 
 def _lead(pieces: Sequence[tuple[float, FloatArray, FloatArray]]) -> float:
-    """By how much what was sensed (T, K) comes later than what the wheels say (T, K), in pieces of a rate [Hz], [s]."""
+    """By how much what was sensed (T, K) comes later than what the wheels say (T, K), in pieces of a rate [Hz], [s].
+
+    Of all smoothings that counts by which a shift leaves least of what there is without one.
+    """
     if not pieces:
         return 0.0
     reach = int(LONGEST_LEAD * pieces[0][0])
     leads = np.arange(-reach, reach + 1) / pieces[0][0]
+    lefts = [_left(pieces, leads, smoothing) for smoothing in SMOOTHINGS]
+    left = min(lefts, key=lambda of_one: float(of_one.min() - of_one[reach]))
+    best = int(np.argmin(left))
+    return float(leads[best]) if left[best] - left[reach] < math.log(CLEARLY) else 0.0
+
+
+def _left(pieces: Sequence[tuple[float, FloatArray, FloatArray]], leads: FloatArray, smoothing: float) -> FloatArray:
+    """Logarithm of what shifts (L,) [s] leave of what was sensed, in parts of its power, of means over a time [s]."""
     sums = np.zeros((3, len(leads), pieces[0][1].shape[1]))
     for rate, sensed, rolled in pieces:
         known: BoolArray = np.asarray(np.isfinite(sensed) & np.isfinite(rolled))
         there = known.astype(np.float64)
-        ours, theirs = _centred(sensed, known), _centred(rolled, known)
+        width = max(1, round(smoothing * rate))
+        ours, theirs = (
+            np.where(known, ndimage.uniform_filter1d(_centred(values, known), width, axis=0, mode="constant"), 0.0)
+            for values in (sensed, rolled)
+        )
         lags = np.arange(1 - len(known), len(known)) / rate
         # Of what overlaps with each shift: products, and powers of both.
         for total, one, other in zip(sums, (ours, ours**2, there), (theirs, there, theirs**2), strict=True):
             for k in range(total.shape[1]):
                 total[:, k] += np.interp(leads, lags, signal.correlate(one[:, k], other[:, k])) / rate
     alike = np.clip(sums[0], 0.0, None) ** 2 / np.maximum(sums[1] * sums[2], 1e-300)
-    left = np.sum(np.log(np.maximum(1.0 - alike, 1e-12)), axis=1)
-    best = int(np.argmin(left))
-    clear = left[best] - left[reach] < math.log(CLEARLY)
-    return float(leads[best]) if clear else 0.0
+    left: FloatArray = np.sum(np.log(np.maximum(1.0 - alike, 1e-12)), axis=1)
+    return left
 
 
 def _centred(values: FloatArray, known: BoolArray) -> FloatArray:

@@ -97,7 +97,7 @@ class RobotProblemBuilder:
 
     def __init__(
         self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None, live: bool = False,
-        lifted: bool = False,
+        lifted: bool = False, leads: FloatArray | None = None,
     ) -> None:
         """Filter the recordings.
 
@@ -107,6 +107,8 @@ class RobotProblemBuilder:
             cutoff: of the channel filter [Hz]; None chooses it from the noise of the encoders.
             live: these are windows of a running robot, or what they are judged by: see `quiet_torque`.
             lifted: the wheels were off the ground; see `joint_balance`.
+            leads: by how much other recordings of this robot say that the stamps of IMU and tracker are ahead (2,) [s]; None
+                has these say so.
 
         Raises:
             MismatchError: no piece is long enough; or off the ground, where torques are all there is, none were recorded.
@@ -131,7 +133,7 @@ class RobotProblemBuilder:
         self.model = ChannelModel(described, self.numbers, self.layout)
         self.motions = self._motions_of(self.model)
         # By how much clocks are ahead that are far off; columns are taken as if that were known.
-        self._leads = np.zeros(2)
+        self._leads, self._said = np.zeros(2), leads
         self._seeming: ModelNumbers | None = None
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
@@ -143,6 +145,11 @@ class RobotProblemBuilder:
     def channels(self) -> tuple[Channel, ...]:
         """Channels that these recordings can fill."""
         return self.layout.channels()
+
+    @property
+    def leads(self) -> FloatArray | None:
+        """By how much the stamps of IMU and tracker are ahead (2,) [s], as far as that is known; None: not by much."""
+        return self._leads if self._leads.any() else None
 
     def build(self, with_terms: bool = True, keys: Collection[str] | None = None) -> RegressionProblem:
         """Return the regression problem of all recordings.
@@ -218,7 +225,7 @@ class RobotProblemBuilder:
             return self._as_read()
         # Behind wheels that spin a robot is late; clocks that are late themselves must not tell that they do.
         slides = [wheels_slide(self.numbers, motion, self.layout) for motion in self.motions]
-        self._leads = clock_leads(self.motions, self.numbers, slides)
+        self._leads = clock_leads(self.motions, self.numbers, slides) if self._said is None else self._said
         if self._leads.any():
             self.motions = self._motions_of(self.model, leads=self._leads)
         if self.layout.balanced:

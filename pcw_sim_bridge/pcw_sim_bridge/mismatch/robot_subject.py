@@ -68,6 +68,7 @@ class RobotSubject:
         self.robot, self._read = robot, read
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
+        self._leads: FloatArray | None = None
         self._choosing = threading.Lock()
         self._undescribed = Undescribed()
         self._missing: tuple[str, ...] = ()
@@ -163,8 +164,13 @@ class RobotSubject:
         return model_awaits_compiling()
 
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
-        """Return the regression problem."""
-        return self._builder(opened).build()
+        """Return the regression problem of the recordings that are fitted."""
+        self._leads = None
+        builder = self._builder(opened)
+        problem = builder.build()
+        # In what is held out the same clocks are ahead by as much, though the robot may move too little to show it.
+        self._leads = builder.leads
+        return problem
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
         """Return recordings with torques at the joints; where they are in unknown units, as they are, with a warning.
@@ -237,7 +243,7 @@ class RobotSubject:
     def _builder(self, opened: Sequence[Opened]) -> RobotProblemBuilder:
         recordings, robot = [o.recording for o in opened], self._seen_robot()
         try:
-            return RobotProblemBuilder(robot, recordings, self._band(opened), lifted=self._off_ground)
+            return RobotProblemBuilder(robot, recordings, self._band(opened), lifted=self._off_ground, leads=self._leads)
         except MismatchError as error:
             told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
             raise MismatchError("; ".join((str(error), *told))) from None
@@ -270,7 +276,7 @@ class RobotSubject:
         robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
         subject = RobotSubject(retuned_robot(robot, retuned))
         as_it_really_is(subject.robot)
-        subject._cutoff, subject._lifted = self._cutoff, self._lifted
+        subject._cutoff, subject._lifted, subject._leads = self._cutoff, self._lifted, self._leads
         subject._undescribed = Undescribed.of(retuned, self.robot.caster_names)
         return subject
 
