@@ -50,7 +50,8 @@ def clock_leads(motions: Sequence[RobotMotion], numbers: ModelNumbers, sliding: 
 def _lead(pieces: Sequence[tuple[float, FloatArray, FloatArray]]) -> float:
     """By how much what was sensed (T, K) comes later than what the wheels say (T, K), in pieces of a rate [Hz], [s].
 
-    Of all smoothings that counts by which a shift leaves least of what there is without one.
+    Of all smoothings that counts by which a shift leaves least of what there is without one; the others have to say at least
+    that it leaves less. A clock does not mind how long one looks: what is late for a moment, behind wheels that slip, does.
     """
     if not pieces:
         return 0.0
@@ -59,7 +60,8 @@ def _lead(pieces: Sequence[tuple[float, FloatArray, FloatArray]]) -> float:
     lefts = [_left(pieces, leads, smoothing) for smoothing in SMOOTHINGS]
     left = min(lefts, key=lambda of_one: float(of_one.min() - of_one[reach]))
     best = int(np.argmin(left))
-    return float(leads[best]) if left[best] - left[reach] < math.log(CLEARLY) else 0.0
+    agreed = all(of_one[best] <= of_one[reach] for of_one in lefts)
+    return float(leads[best]) if agreed and left[best] - left[reach] < math.log(CLEARLY) else 0.0
 
 
 def _left(pieces: Sequence[tuple[float, FloatArray, FloatArray]], leads: FloatArray, smoothing: float) -> FloatArray:
