@@ -10,9 +10,10 @@ from scipy import optimize
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.command_findings import command_findings, with_rivals
+from pcw_sim_bridge.mismatch.command_findings import _not_borne_out, command_findings, with_rivals
 from pcw_sim_bridge.mismatch.command_tracking import command_problems
 from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
+from pcw_sim_bridge.mismatch.findings import REFUSED
 from pcw_sim_bridge.mismatch.held_commands import held_commands
 from pcw_sim_bridge.mismatch.reported_torques import coarse_step, doubtful_reports, told_of, unlikely_factor
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
@@ -97,6 +98,44 @@ def test_a_proof_needs_no_numbers_to_try(searched):
     for name in ROBOT.caster_names:
         proof = proofs[f"command_tracking/{name}_steer"]
         assert proof.after < 1.1 * proof.floor < 0.5 * proof.before
+
+
+@pytest.mark.parametrize("borne_out", [True, False])
+def test_what_held_out_commands_do_not_bear_out_is_not_proposed(borne_out):
+    """Of every twelfth message two limits of torque were named, with certainty; held out the error was larger with them."""
+    lag = EffectInstance("actuator_lag", ROBOT.caster_names[:1], {"time_constant": 0.008}, "steer")
+    runs = [
+        simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 12.0, seed), effects)
+        for seed, effects in ((3, [lag]), (4, [lag] if borne_out else []))
+    ]
+    findings = command_findings(
+        command_problems(ROBOT, runs[:1]), command_problems(ROBOT, runs[1:], False), 0, None, lambda message: None
+    )
+    assert [named.term.effect for named, _ in findings.named] == (["actuator_lag"] if borne_out else [])
+    refused = [step for step in findings.ladder if step.outcome.startswith(REFUSED)]
+    assert len(refused) == len(findings.notes) == (0 if borne_out else 1)
+    assert all("actuator_lag" in step.description and step.gain < 0.0 for step in refused)
+
+
+def test_joints_that_say_the_same_are_borne_out_together_or_not_at_all():
+    """Of four drives with one dead time held-out data contradicted two; of the others they said next to nothing."""
+    recording = simulate(World(ROBOT, ROBOT, "reduced"), Run("run", "identification", 12.0, 3), ())
+    problems = [p for p in command_problems(ROBOT, [recording]) if p.channels[0].axis == "drive"]
+    lag = next(k for k, term in enumerate(problems[0].terms) if term.effect == "actuator_lag")
+    instance = Instance(lag, (("time_constant", 0.0014),), problems[0].terms[lag].base_indices())
+    term = problems[0].terms[lag]
+
+    def explained(part):
+        named = NamedTerm(instance, term, {}, 1.0, (), 9.0, 9.0, np.zeros((1, 1)))
+        mean = np.r_[np.zeros(len(problems[0].nuisances)), [part] * len(instance.active)]
+        fit = SimpleNamespace(instances=(instance,), mean=mean)
+        return SimpleNamespace(named=(named,), fit=fit)
+
+    others = {p.channels[0].name: p for p in problems}
+    against, hardly = explained(1.0), explained(0.0)
+    names = [p.channels[0].name for p in problems]
+    assert set(_not_borne_out(problems, others, [against, hardly, hardly, None])) == set(names[:3])
+    assert _not_borne_out(problems, others, [hardly, hardly, hardly, None]) == {}
 
 
 @pytest.mark.parametrize(("part_of_a_delay", "doubted"), [(90.0, True), (-2.0, True), (-20.0, False)])

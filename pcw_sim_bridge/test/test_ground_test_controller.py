@@ -1,5 +1,6 @@
 """The controller that tests the ground on request, with a plant in lock-step, as processes over real DDS."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -22,7 +23,10 @@ from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
 from pcw_description.nodes.node_tools import LATCHED, ns_to_stamp, stamp_to_ns  # noqa: E402
 from pcw_description.robot_file import save_robot  # noqa: E402
+from pcw_sim_bridge.ground_test import GroundTest  # noqa: E402
+from pcw_sim_bridge.nodes.ground_test_messages import caster_parts  # noqa: E402
 from pcw_sim_bridge.terrain_study import on_ground  # noqa: E402
+from pcw_terrain.active_identification import Refusal  # noqa: E402
 
 THESIS = load_robot("thesis")
 CASTERS = list(THESIS.caster_names)
@@ -220,3 +224,14 @@ def test_another_controller_ends_the_test(drive):
     answer = drive.ask()
     assert not answer.success and "controller = 'resolved_motion_rate' is not allowed" in answer.message
     assert not drive.tested or not drive.tested[-1].name
+
+
+def test_a_caster_that_is_asked_again_waits_and_is_not_left_out_yet():
+    test = GroundTest(THESIS)
+    state = test.request(test.initial_state())
+    testing = dataclasses.replace(state.testing, queue=(1, 0), refused=((0, Refusal.TORQUE), (3, Refusal.TOO_SLOW)))
+    parts = caster_parts(THESIS.caster_names, dataclasses.replace(state, testing=testing))
+    said = [parts[name].message for name in THESIS.caster_names]
+    assert said[0] == f"waits until the others have told of the ground: {Refusal.TORQUE.value}"
+    assert said[1:3] == ["not tested yet", "not tested yet"]
+    assert said[3] == f"left out: {Refusal.TOO_SLOW.value}"

@@ -18,7 +18,7 @@ from pcw_description.robot_description import AXIS_NAMES
 from .common_effect import in_common
 from .evidence_selection import EffectSearch
 from .explanation import AMBIGUOUS, HALF_WIDTH, Estimate, Explanation, NamedTerm, explain
-from .findings import ChannelFinding, ChannelProof, LadderFinding, LocationFinding
+from .findings import REFUSED, ChannelFinding, ChannelProof, LadderFinding, LocationFinding
 from .found_effect import effect_instance
 from .open_set import Leftover
 from .paired_errors import PairedErrors, blocks_of, interval
@@ -33,6 +33,8 @@ SHARE_OF_COMMON = 0.1
 CLEAR = 100.0
 # A first look at every so many of the numbers that are tried: what lies between two of them looks nearly like either.
 FIRST_LOOK_STEP = 2
+# What an effect does to held-out data at least, if they are to say anything of it [nats].
+AT_WORK = 5.0
 # Numbers of several joints agree where chance alone would part them further once in so many.
 AGREEING = 0.999
 
@@ -82,9 +84,18 @@ def command_findings(
     """
     others = {problem.channels[0].name: problem for problem in held_out}
     found = CommandFindings()
-    for problem, explanation in zip(problems, _explanations(problems, seed, settings), strict=True):
+    explanations = _explanations(problems, seed, settings)
+    against = _not_borne_out(problems, others, explanations)
+    for problem, explanation in zip(problems, explanations, strict=True):
         rng = np.random.default_rng(seed)
         channel = problem.channels[0]
+        other = others.get(channel.name)
+        refused: tuple[LadderFinding, ...] = ()
+        if explanation is not None and channel.name in against:
+            nats, reason = against[channel.name], f"{REFUSED}: the error is no smaller with it"
+            labels = [explanation.search.label(named.instance) for named in explanation.named]
+            refused = tuple(LadderFinding(f"drop {label}", nats, nats, reason) for label in labels)
+            explanation = dataclasses.replace(explanation, named=())
         added, floor = np.zeros_like(problem.residual), _size(problem, problem.residual)
         flagged = False
         if explanation is not None:
@@ -95,7 +106,6 @@ def command_findings(
                 progress(f"{channel.name}: {explanation.search.label(named.instance)}")
         p_value = 1.0 if explanation is None else float(explanation.p_values[0])
         finding = ChannelFinding(channel.name, channel.unit, _size(problem, problem.residual), floor, p_value, flagged)
-        other = others.get(channel.name)
         proof = (
             _proof(problem, added, floor, rng) if other is None
             else _proof(other, _predicted(problem, other, explanation), floor, rng)
@@ -106,9 +116,43 @@ def command_findings(
             (*found.leftovers, *(explanation.leftovers if explanation else ())),
             (*found.locations, *(_location(problem, named) for named in (explanation.named if explanation else ()))),
             (*found.proofs, proof),
-            (*found.ladder, *_ladder(explanation)),
+            (*found.ladder, *_ladder(explanation), *refused),
+            (*found.notes, *(f"{s.description.removeprefix('drop ')} was {s.outcome}. It is not proposed." for s in refused)),
         )
     return _shared(found, problems)
+
+
+def _not_borne_out(
+    problems: Sequence[RegressionProblem],
+    others: Mapping[str, RegressionProblem],
+    explanations: Sequence[Explanation | None],
+) -> dict[str, float]:
+    """Channels whose effects are at work in held-out data and make the error there no smaller, and by how much they do [nats].
+
+    Each by itself, and all joints of an axis that say the same together. Of commands of which only every fifth or twelfth was
+    recorded a lag or a limit explains a little, in one recording.
+    """
+    said: dict[tuple[str, ...], dict[str, tuple[float, float]]] = {}
+    for problem, explanation in zip(problems, explanations, strict=True):
+        channel = problem.channels[0]
+        other = others.get(channel.name)
+        if explanation is None or other is None or not explanation.named:
+            continue
+        added = _predicted(problem, other, explanation)
+        rest = other.residual - added
+        scale = 2.0 * max(_size(other, rest) ** 2, 1e-300)
+        before, after, work = (
+            float(np.sum(values[other.valid] ** 2)) / scale for values in (other.residual, rest, added)
+        )
+        effects = (channel.axis, *sorted(named.term.effect for named in explanation.named))
+        said.setdefault(effects, {})[channel.name] = (before - after, work)
+    found = {}
+    for joints in said.values():
+        together = [sum(values) for values in zip(*joints.values(), strict=True)]
+        for name, own in joints.items():
+            if any(work > AT_WORK and nats <= 0.0 for nats, work in (own, together)):
+                found[name] = own[0]
+    return found
 
 
 def _explanations(
@@ -209,7 +253,7 @@ def _shared(found: CommandFindings, problems: Sequence[RegressionProblem]) -> Co
                     f"{effect} shows in {axis} of {' and '.join(targets)}. In {' and '.join(others)} it hardly would, and "
                     "nothing speaks against it there: that all have it is assumed of drives of one kind."
                 )
-    return dataclasses.replace(found, named=tuple(named), locations=tuple(locations), notes=tuple(notes))
+    return dataclasses.replace(found, named=tuple(named), locations=tuple(locations), notes=(*found.notes, *notes))
 
 
 def _speaks_against(problem: RegressionProblem, named: NamedTerm) -> bool:

@@ -58,6 +58,8 @@ def caster_parts(names: Sequence[str], state: GroundTestState) -> dict[str, Stat
             )
         elif ground.said[i]:
             parts[name] = Status(WARN, f"its test told nothing: {ground.said[i]}")
+        elif left_out.get(i, Refusal.NONE) is not Refusal.NONE and i in state.testing.queue:
+            parts[name] = Status(OK, f"waits until the others have told of the ground: {left_out[i].value}")
         elif left_out.get(i, Refusal.NONE) is not Refusal.NONE:
             parts[name] = Status(WARN, f"left out: {left_out[i].value}")
         elif i in state.testing.tested:
