@@ -151,7 +151,7 @@ def _not_borne_out(
         together = [sum(values) for values in zip(*joints.values(), strict=True)]
         for name, own in joints.items():
             if any(work > AT_WORK and nats <= 0.0 for nats, work in (own, together)):
-                found[name] = own[0]
+                found[name] = min(own[0], together[0])
     return found
 
 
