@@ -764,6 +764,19 @@ def test_a_parameter_that_stands_in_place_of_a_number_is_reported_whole():
     assert estimate.high - estimate.low == pytest.approx(2.0 * 1.96 * 0.002 / np.sqrt(len(time) / 2.0), rel=0.3)
 
 
+def test_a_parameter_that_is_unsure_in_itself_has_an_interval_that_says_so():
+    """Noise alone would know a play to a hundredth; when a motor runs free is not seen as well as that."""
+    time = np.arange(3000) / RATE
+    column = np.sin(1.9 * time)
+    noise = 0.002 * np.random.default_rng(3).standard_normal(len(time))
+    problem = linear_problem(0.5 * column + noise, {"play": (column, 100.0)})
+    term = dataclasses.replace(problem.terms[0], unsure={"size": 0.2})
+    problem = dataclasses.replace(problem, terms=(term,), scale_deviation=0.0)
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    estimate = named_terms(search, search.conclude((Instance(0, (), (0,)),), 5.0))[0].estimates["size"]
+    assert estimate.high - estimate.low == pytest.approx(2.0 * 1.96 * 0.2 * 0.5, rel=0.01)
+
+
 def test_an_exchange_that_does_not_last_leaves_the_selection_where_it_was(monkeypatch):
     """Numbers, intervals and what held-out recordings say are asked at the place where the selection is exact."""
     time = np.arange(3000) / RATE

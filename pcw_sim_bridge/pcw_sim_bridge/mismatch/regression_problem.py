@@ -160,6 +160,7 @@ class Term:
         settled: shaping parameters that are as usual until the search has ended, and then where the model's slopes lead:
             spacing, least and largest value by name.
         blur: by how much shaping parameters are uncertain besides what noise does: standard deviations by name.
+        unsure: by which parts of themselves linear parameters are.
         scan: cheaper, slightly inexact columns of all `shapes` at once, (T, C, len(shapes), len(parameters)), where the
             grid is long; None uses `columns`.
         grid_size: how many shapes `shapes` were chosen from, where a first look has narrowed them down.
@@ -189,6 +190,7 @@ class Term:
     least: Mapping[str, float] = dataclasses.field(default_factory=dict)
     settled: Mapping[str, tuple[float, float, float]] = dataclasses.field(default_factory=dict)
     blur: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    unsure: Mapping[str, float] = dataclasses.field(default_factory=dict)
     scan: Callable[[], FloatArray] | None = None
     grid_size: int = 0
     log_prior: float = 0.0

@@ -73,6 +73,8 @@ from .signal_filter import SignalFilter, derivative
 Sides = tuple[FloatArray, FloatArray]
 # A gear's play changes sides once its torque is this part of its size the other way: below it are noise and free rolling.
 PLAY_TORQUE = 0.1
+# Periods of its cutoff that a step needs behind a filter from there to half of its height.
+RISE = 0.2
 # How often a wheel's load and what it does to the wheel are found from each other, down to so many metres.
 LOAD_ROUNDS, LEAST_LIFT = 6, 1e-6
 # What begins between two samples of a motion is seen so many times between them.
@@ -203,7 +205,8 @@ def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, ge
     torque = shaft[:, axis] - rotor * (motion.acceleration[:, i] @ coupling[axis])
     ahead = _lagging(torque / gear.stiffness, gear.damping / gear.stiffness * motion.rate)
     if gear.play > 0.0:
-        ahead = ahead + 0.5 * gear.play * _flank(torque, motion.velocity[:, i] @ coupling[axis])
+        blur = RISE / motion.cutoff * motion.rate
+        ahead = ahead + 0.5 * gear.play * _flank(torque, motion.velocity[:, i] @ coupling[axis], blur)
     smooth = SignalFilter(motion.rate, motion.cutoff).smooth(ahead)
     moved: FloatArray = smooth[:, None] * np.linalg.inv(coupling)[:, axis]
     return moved
@@ -218,23 +221,30 @@ def _lagging(values: FloatArray, lag: float) -> FloatArray:
     return followed
 
 
-def _flank(torque: FloatArray, rate: FloatArray) -> FloatArray:
+def _flank(torque: FloatArray, rate: FloatArray, blur: float) -> FloatArray:
     """Which flank of its play a gear lies on under a torque (T,): 1, -1, between them, and 0 before the first clear torque.
 
     Where next to no torque passes through it the motor is free. If it then comes to lie on the other flank, it has left the
     one with the joint's speed and gone ahead ever faster: with the square of the way (T,) of its rate [rad/s], so that nothing
     is crossed at rest. If it comes to lie on the same flank again, it has not left it.
+
+    Args:
+        blur: samples by which a filter shows the torque of the flank that is hit before it is hit.
     """
-    count = len(torque)
-    clear = np.abs(torque) > PLAY_TORQUE * float(np.sqrt(np.mean(torque**2)))
-    index = np.arange(count)
-    last = np.maximum.accumulate(np.where(clear, index, -1))
-    following = np.minimum.accumulate(np.where(clear, index, count)[::-1])[::-1]
-    following = np.where(following < count, following, last)
+    clear = np.flatnonzero(np.abs(torque) > PLAY_TORQUE * float(np.sqrt(np.mean(torque**2))))
+    index, sides = np.arange(len(torque)), np.sign(torque[clear])
+    changes = np.flatnonzero(np.diff(sides))
+    flank = np.where(index >= clear[0], sides[0], 0.0) if len(clear) else np.zeros(len(torque))
+    if not len(changes):
+        return flank
+    left, reached = clear[changes], sides[changes + 1]
+    hit = np.minimum(clear[changes + 1] + blur, np.append(left[1:], index[-1]))
     way = np.cumsum(np.abs(rate))
-    crossed = (way - way[last]) / np.maximum(way[following] - way[last], 1e-300)
-    left, reached = np.sign(torque[last]), np.sign(torque[following])
-    flank: FloatArray = np.where(last >= 0, left + (reached - left) * np.clip(crossed, 0.0, 1.0) ** 2, 0.0)
+    latest = np.searchsorted(left, index, side="right") - 1
+    whole = np.interp(hit, index, way) - way[left]
+    crossed = np.clip((way - way[left[latest]]) / np.maximum(whole[latest], 1e-300), 0.0, 1.0)
+    crossed[index >= hit[latest]] = 1.0
+    flank[latest >= 0] = (reached[latest] * (2.0 * crossed**2 - 1.0))[latest >= 0]
     return flank
 
 

@@ -45,6 +45,8 @@ HEIGHTS = 0.5  # of the typical height, the distance of neighbours
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 TURNED = 0.3  # [rad], of a ripple's phase, by a zero of the steering that was re-tuned; less is a detail
 LEANING = 2e-4  # [rad], of a floor that was re-tuned; what it adds to an accelerometer is lost in the noise of most
+# Of itself, by which a play in a steering gear is known at best: when a motor runs free is seen through the channels' filter.
+STEERED_PLAY = 0.12
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
@@ -315,6 +317,7 @@ class _TermMaker:
             is_curved=not (isinstance(effect, ClockEffect) and self.exact_clocks),
             resolution=chosen.resolution,
             blur=self._blur_of_times() if look == "windows" else {},
+            unsure={"play": STEERED_PLAY} if axis == "steer" and "play" in names else {},
             settled=_heights(effect) if {"x", "y"} == set(chosen.resolution) else {},
             grid_size=chosen.among,
             turning=turning is not None,
