@@ -378,6 +378,14 @@ class RobotDescription:
         )
 
     @cached_property
+    def gear_coupling(self) -> FloatArray:
+        """Motor angles, joint side, from joint angles E (n, 2, 2): the rows of the gear matrix over its diagonal.
+
+        Torques u of the motors, joint side, are E^T u on the joints.
+        """
+        return _constant(self.gear_matrix / np.einsum("nii->ni", self.gear_matrix)[:, :, None])
+
+    @cached_property
     def armature(self) -> FloatArray:
         """Rotor inertias seen at the joints, N^T diag(J) N, (n, 2, 2) [kg m^2]."""
         matrices = []

@@ -22,6 +22,7 @@ from pcw_sim_bridge.simulated_robot import SimulatedRobot
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
+XR4000 = load_robot("xr4000")  # turning a steering rolls the drive's motor
 # No steer/drive coupling, equal wheels: what one joint does is not hidden by another.
 RADIUS = float(THESIS.wheel_radius[0])
 WEIGHT = THESIS.total_mass * GRAVITY
@@ -215,6 +216,30 @@ def test_cogging_has_its_order_and_size(plant_name):
     np.testing.assert_allclose(coefficients(order), [cosine, sine], atol=0.01 * math.hypot(cosine, sine))
     for other in (order / 2, order - 3.0, order + 3.0, 2 * order):
         assert np.hypot(*coefficients(other)) < 0.05 * math.hypot(cosine, sine)
+
+
+def test_what_a_motor_does_of_itself_reaches_both_joints_of_coupled_gears(plant_name):
+    """A torque constant and a cogging are a motor's, whose angle and torque are those of neither joint; with gears uncoupled
+    such robots had tenths of a drive's torque on their steerings that nothing explained.
+    """
+    coupling, angle, order = XR4000.gear_coupling[0], 0.4, 3.0
+    assert coupling[DRIVE, STEER] == pytest.approx(-0.5)
+    torque = np.tile([0.4, -0.1], (4, 1))
+    motor = torque[0] @ np.linalg.inv(coupling)
+    ripple = 0.3 * math.cos(order * float(coupling[DRIVE] @ [0.0, angle]))
+    for entry, size in (
+        ({"name": "torque_constant_error", "error": -0.25}, -0.25 * motor[DRIVE]),
+        ({"name": "torque_constant_error", "error": 0.5, "axis": "steer"}, 0.5 * motor[STEER]),
+        ({"name": "motor_cogging", "cosine": 0.3, "sine": 0.0, "order": order}, ripple),
+    ):
+        rates = []
+        row = coupling[STEER if entry.get("axis") == "steer" else DRIVE]
+        for entries, given in ([entry], torque), ([], torque + size * row):
+            with Rig(plant_name, *entries, robot=XR4000, lifted=True, dt=1e-4) as rig:
+                rig.spin(angle=angle)
+                rates.append(rig.run(1e-4, given)[-1].joint_velocity)
+        np.testing.assert_allclose(rates[0], rates[1], rtol=1e-3)
+        assert np.abs(rates[0]).min() > 1e-4
 
 
 def test_rolling_resistance_follows_the_load(plant_name):

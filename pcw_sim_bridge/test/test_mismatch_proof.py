@@ -653,6 +653,16 @@ def test_manoeuvres_that_disagree_do_not_contradict_what_fitted_data_are_sure_of
     assert speaks_for_it or nats == pytest.approx(-32.0, rel=0.1)
 
 
+@pytest.mark.parametrize("again", [True, False])
+def test_a_push_that_did_not_come_again_is_no_part_of_the_proof(again: bool) -> None:
+    """At work in one manoeuvre alone it is one about which manoeuvres disagree; a push that was found exactly was refused."""
+    fitted = np.array([[40.0, 0.0], [40.0, 9.0], [40.0, 9.0]])
+    tests = [np.array([[8.0, 0.0], [0.0, 0.0], [0.0, 0.0]])] * 7 + [np.array([[0.0, 0.0], [0.0, 8.0], [0.0, 8.0 * again]])]
+    held_out = judged_by(fitted, tests, 10.0)
+    assert held_out.help_of(0)[0] > 0.0
+    assert proof._tells(held_out, 0) is again
+
+
 @pytest.mark.parametrize(
     ("contradicted", "share", "times_floor", "stays"),
     [

@@ -16,7 +16,7 @@ from pcw_description.contact.contact_model import LENGTH, slip_under_load, tyre_
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
-from pcw_description.robot_description import AXIS_NAMES
+from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
 from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
 from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
@@ -27,6 +27,7 @@ from pcw_sim_bridge.mismatch.rolling_model import (
     ChannelLayout,
     ModelNumbers,
     Surroundings,
+    _scaled_by_motors,
     channel_sides,
     slips,
     wheel_motion,
@@ -58,8 +59,9 @@ def record(
 ) -> Recording:
     """Drive `robot` under a controller that knows only the nominal one."""
     path = folder / f"run{seed}"
-    record_run(robot, twist, DURATION, seed, path, plant, controlled_as=load_robot("thesis"))
-    return Recording.open(path, load_robot("thesis"))
+    described = load_robot(robot.name)
+    record_run(robot, twist, DURATION, seed, path, plant, controlled_as=described)
+    return Recording.open(path, described)
 
 
 @pytest.fixture(scope="module")
@@ -460,6 +462,48 @@ def test_an_effect_that_the_description_holds_is_not_left_over(tmp_path: Path) -
     after = RobotProblemBuilder(patched, [recording]).build()
     rms = [np.sqrt(np.mean(np.where(p.valid, p.residual, 0.0)[:, :3] ** 2, axis=0)) for p in (before, after)]
     assert np.all(rms[1][:2] < 0.3 * rms[0][:2])
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"name": "torque_constant_error", "error": -0.2},
+        {"name": "motor_cogging", "cosine": 0.6, "sine": 0.3, "order": 5.0},
+    ],
+    ids=lambda entry: entry["name"],
+)
+def test_what_a_motor_does_is_found_at_both_joints_of_coupled_gears(tmp_path: Path, entry: dict[str, object]) -> None:
+    """With the effect in its file the robot leaves what a healthy one does, and the candidate's columns are what it does."""
+    nominal = load_robot("xr4000")
+    physics = read_physics([{**entry, "target": ["left"], "axis": "drive"}], nominal.caster_names)
+    true = dataclasses.replace(nominal, physics=physics)
+    recording, healthy = record(tmp_path / "true", true, 5), record(tmp_path / "healthy", nominal, 5)
+    problems = [RobotProblemBuilder(*of).build() for of in ((nominal, [recording]), (true, [recording]), (nominal, [healthy]))]
+    left = [np.sqrt(np.mean(np.where(p.valid, p.residual, 0.0)[:, :3] ** 2, axis=0)) for p in problems]
+    assert np.all(left[0] > 1.5 * left[2])
+    assert np.all(left[1] < 1.2 * left[2])
+    term = next(t for t in problems[0].terms if t.key == f"{entry['name']}/drive of left")
+    shape = {name: entry[name] for name in ("order",) if name in entry}
+    told = term.columns(shape) @ np.array([entry[p.name] for p in term.parameters])  # type: ignore[arg-type]
+    both = problems[0].valid & problems[1].valid
+    works = problems[0].residual - problems[1].residual
+    for channel in range(3):
+        error = np.linalg.norm((told - works)[both[:, channel], channel])
+        assert error < 0.01 * np.linalg.norm(works[both[:, channel], channel])
+
+
+def test_torques_that_were_calibrated_joint_by_joint_are_errors_of_motors_and_a_crosstalk() -> None:
+    """Whichever a healthy robot's drives were calibrated by, within tolerance it has nothing missing."""
+    robot = load_robot("tidybot2")
+    numbers = ModelNumbers.of(robot)
+    torque = np.random.default_rng(0).standard_normal((20, robot.n, 2))
+    numbers.gain[1] = [1.02, 0.97]
+    of_motors = _scaled_by_motors(torque, numbers)
+    shafts = torque[:, 1] @ np.linalg.inv(robot.gear_coupling[1])
+    np.testing.assert_allclose(of_motors[:, 1], (shafts * [0.02, -0.03]) @ robot.gear_coupling[1])
+    assert not of_motors[:, [0, 2, 3]].any()
+    numbers.crosstalk[1] = -0.05 * robot.gear_coupling[1, DRIVE, STEER]
+    np.testing.assert_allclose(_scaled_by_motors(torque, numbers)[:, 1], torque[:, 1] * [0.02, -0.03])
 
 
 @pytest.mark.nightly

@@ -93,6 +93,12 @@ def test_torques_lost_in_a_joint_are_no_unit(plain):
     assert found(THESIS, cogging)[0] is None
 
 
+def test_steerings_of_coupled_gears_that_count_the_other_way_round_are_told():
+    """Reports are of joints; what a motor does there reaches both."""
+    units, _ = found(TIDYBOT, recorded(TIDYBOT), np.array([1.0, -1.0]))
+    assert units is not None and units.is_known and "those of the steerings count the other way round" in units.warning
+
+
 def test_motors_behind_coupled_gears_are_told_and_left(plain):
     """A turning steering turns the drive motor too: no factor makes torques at the joints of theirs."""
     units, _ = found(TIDYBOT, recorded(TIDYBOT), np.array([1.0 / 8.14, 1.0 / 12.8]))

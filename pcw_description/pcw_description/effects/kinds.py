@@ -72,8 +72,8 @@ class JointTorqueEffect(Effect):
         torque: compiled kernel (position [rad], velocity [rad/s], motor_torque [N m], normal_force [N],
             parameters (len(self.parameters),)) -> torque [N m] and minus its slope over velocity [N m s/rad], by which
             plants take friction implicitly; on a linear bench axis m, m/s and N instead.
-        motor_side: it acts on the motor, before a gear that plays or twists; position and velocity are the motor's,
-            joint side.
+        motor_side: it acts on the motor, before gears that play, twist or are coupled; position, velocity and motor_torque
+            are the motor's own, joint side, and its torque goes to both joints where their gears are coupled.
     """
 
     torque: Callable[..., tuple[float, float]] = dataclasses.field(default=lambda *_: (0.0, 0.0), repr=False)

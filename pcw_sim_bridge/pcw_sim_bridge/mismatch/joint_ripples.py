@@ -134,7 +134,8 @@ def _bands(robot: RobotDescription, recording: Recording, lowest: float) -> list
     slow = signal.butter(2, lowest, fs=rate, output="sos")
     found = []
     for i, k in np.ndindex(robot.n, 2):
-        angle, velocity, torque = values[:, i, k].T
+        _, velocity, torque = values[:, i, k].T
+        angle = values[:, i, :, 0] @ robot.gear_coupling[i, k]  # of the motor: it is what ripples
         if not (np.isfinite(angle).all() and np.isfinite(velocity).all()) or np.ptp(angle) < LEAST_TURNS * math.tau:
             continue
         speed = np.abs(signal.sosfiltfilt(slow, velocity))[::every]

@@ -744,9 +744,11 @@ def with_channels(finding: FitFinding, more: Sequence[ChannelProof]) -> FitFindi
 
 
 def _tells(held_out: HeldOut, index: int) -> bool:
-    """Whether an effect is at work in what was held out, and helps there."""
-    nats, work = held_out.help_of(index)
-    return work > AT_WORK and nats > 0.0
+    """Whether an effect is at work in what was held out, and the error there is smaller with it.
+
+    What comes once is at work in one manoeuvre: that manoeuvres disagree about it says nothing for it.
+    """
+    return held_out.help_of(index)[1] > AT_WORK and held_out.is_smaller_with(index)
 
 
 def _busy(explanation: Explanation) -> np.ndarray:

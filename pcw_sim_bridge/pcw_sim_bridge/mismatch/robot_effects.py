@@ -197,8 +197,7 @@ def with_true_angles(
 
 def _wind_up(robot: RobotDescription, motion: RobotMotion, i: int, axis: int, gear: Gear) -> FloatArray:
     """How far the readings of caster i are ahead of its joints through a gear (T, 2) [rad], drive and steer."""
-    diagonal = np.diag(robot.gear_matrix[i])
-    coupling = robot.gear_matrix[i] / diagonal[:, None]
+    diagonal, coupling = np.diag(robot.gear_matrix[i]), robot.gear_coupling[i]
     rotors = robot.casters[i].rotors
     rotor = (rotors.drive, rotors.steer)[axis] * diagonal[axis] ** 2
     shaft = motion.quiet_torque[:, i] @ np.linalg.inv(coupling)
@@ -333,6 +332,22 @@ def _between_samples(rows):  # type: ignore[no-untyped-def]
     return between
 
 
+def signals_of(
+    effect: JointTorqueEffect, axis: int, coupling: FloatArray, signals: Sequence[FloatArray]
+) -> tuple[Sequence[FloatArray], FloatArray]:
+    """Return position, velocity and torque (T,) that an effect goes by, and what its torque is on (drive, steer) (2,).
+
+    Args:
+        axis: of the joint, or of the motor of an effect on the motor's side.
+        coupling: of the caster's gears (2, 2), see `RobotDescription.gear_coupling`.
+        signals: position, velocity and torque of both joints (T, 2).
+    """
+    if not effect.motor_side:
+        return [values[:, axis] for values in signals], np.eye(2)[axis]
+    position, velocity, torque = signals
+    return (position @ coupling[axis], velocity @ coupling[axis], torque @ np.linalg.inv(coupling)[:, axis]), coupling[axis]
+
+
 def torque_along(
     effect: JointTorqueEffect, signals: Sequence[FloatArray], torque: Callable[..., FloatArray]
 ) -> FloatArray:
@@ -391,14 +406,15 @@ class ChannelModel:
             axis = AXIS_NAMES.index(instance.axis or effect.axis)
             for name in instance.target:
                 i = self.robot.caster_index(name)
-                position, velocity, force = (s[:, i, axis] for s in (motion.position, motion.velocity, motion.balanced_torque))
-                if axis == STEER:  # of the heading, whatever is read of it
-                    position = self.numbers.headings(motion.position)[:, i]
+                position = motion.position[:, i].copy()
+                position[:, STEER] = self.numbers.headings(motion.position)[:, i]  # whatever is read of them
+                signals = position, motion.velocity[:, i], motion.balanced_torque[:, i]
+                own, row = signals_of(effect, axis, self.robot.gear_coupling[i], signals)
                 found = torque_along(
-                    effect, (position, velocity, force, normal[:, i]),
+                    effect, (*own, normal[:, i]),
                     lambda *at, effect=effect: effect.contribution(*at, instance.parameters)[:, None],
                 )  # fmt: skip
-                torque[:, i, axis] += found[:, 0]
+                torque[:, i] += found * row
             return dataclasses.replace(around, torque=torque)
         if self.layout.lifted:  # there is nothing under the wheels
             return around

@@ -45,6 +45,7 @@ CHANGED_BY = {
     ("payload_offset", "y"): ("chassis.com.y", 1.0),
     ("payload_offset", "z"): ("chassis.com.z", 1.0),
 }
+CROSSTALK = "torque_crosstalk"
 FREQUENCY_DEVIATION = 0.2  # of the chassis on its springs, relative
 
 
@@ -111,6 +112,7 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
         # Nor does anybody know how much rubber damps: by that a soft tyre would be found too short or too long.
         found.append(VariedNumber("contact.damping_time", "s", DAMPING_TIME, 0.5 * DAMPING_TIME, _entry("damping_time")))
         found += _unreported(differences)
+        found += _crosstalk(robot)
     if layout.imu:
         found += _within_cycle(differences)
     found += _suspension(differences)
@@ -322,6 +324,14 @@ def _dynamics(robot: RobotDescription, numbers: ModelNumbers) -> Iterator[Deviat
     for i, caster in enumerate(robot.casters):
         for axis, axis_name in enumerate(AXIS_NAMES):
             yield "torque_constant", f"torque_constant/{caster.name}_{axis_name}", 1.0, _gain(i, axis)
+
+
+def _crosstalk(robot: RobotDescription) -> Iterator[VariedNumber]:
+    """What drives whose torques were calibrated joint by joint, and not motor by motor, err by where gears are coupled."""
+    known = math.sqrt(2.0) * robot.tolerance("torque_constant").value
+    for i, (name, coupling) in enumerate(zip(robot.caster_names, robot.gear_coupling, strict=True)):
+        if coupling[0, 1] and known:
+            yield VariedNumber(f"{CROSSTALK}/{name}", "1", 0.0, known * abs(float(coupling[0, 1])), _entry("crosstalk", i))
 
 
 def common_relaxation(robot: RobotDescription) -> float:

@@ -37,7 +37,7 @@ from .channel_differences import ChannelDifferences
 from .composed_columns import Columns, Placed, Turning, frozen
 from .first_look import Chosen, ChosenShapes, Looked, common_orders, orders, patches, waves, windows
 from .regression_problem import FloatArray, LinearParameter, Shape, Term, term_key
-from .robot_effects import torque_along
+from .robot_effects import signals_of, torque_along
 from .robot_nuisances import CHANGED_BY, FLOOR
 
 DIRECTIONS = 8  # of a grid over all directions
@@ -45,8 +45,9 @@ HEIGHTS = 0.5  # of the typical height, the distance of neighbours
 LARGEST_TWIST = 0.5  # [rad], of a gear under its joint's largest torque; one that gives way by more is none, or has play
 TURNED = 0.3  # [rad], of a ripple's phase, by a zero of the steering that was re-tuned; less is a detail
 LEANING = 2e-4  # [rad], of a floor that was re-tuned; what it adds to an accelerometer is lost in the noise of most
-# Of itself, by which a play in a steering gear is known at best: when a motor runs free is seen through the channels' filter.
-STEERED_PLAY = 0.12
+# Of itself, by which a play in a gear is known at best: when a motor runs free is seen through the channels' filter, and one
+# of a steering does so more often than one of a drive.
+OF_A_PLAY = {"drive": 0.08, "steer": 0.12}
 SQUARED_STEP = 0.5  # of the typical size, where what is in proportion to its square is taken: below it there is none
 # What a leftover may depend on that an effect of a kind explains.
 VARIABLES_OF: dict[type[Effect], tuple[str, ...]] = {
@@ -181,10 +182,10 @@ class _TermMaker:
         for motion, normal in zip(self.differences.motions, self.differences.normal, strict=True):
             found = np.zeros((*motion.position.shape, len(effect.linear_parameters)))
             for i, by in zip(casters, turned or len(casters) * [0.0], strict=True):
-                signals = motion.position, motion.velocity, motion.balanced_torque
-                position, velocity, force = (s[:, i, column] for s in signals)
-                position = position + by
-                found[:, i, column] = torque_along(effect, (position, velocity, force, normal[:, i]), parts)
+                signals = motion.position[:, i], motion.velocity[:, i], motion.balanced_torque[:, i]
+                (position, *others), row = signals_of(effect, column, self.robot.gear_coupling[i], signals)
+                along = torque_along(effect, (position + by, *others, normal[:, i]), parts)
+                found[:, i] = row[:, None] * along[:, None, :]
             torques.append(found)
         return self.differences.of_torque(torques)
 
@@ -317,7 +318,7 @@ class _TermMaker:
             is_curved=not (isinstance(effect, ClockEffect) and self.exact_clocks),
             resolution=chosen.resolution,
             blur=self._blur_of_times() if look == "windows" else {},
-            unsure={"play": STEERED_PLAY} if axis == "steer" and "play" in names else {},
+            unsure={"play": OF_A_PLAY[axis or effect.axis]} if "play" in names else {},
             settled=_heights(effect) if {"x", "y"} == set(chosen.resolution) else {},
             grid_size=chosen.among,
             turning=turning is not None,

@@ -59,8 +59,8 @@ from .signal_filter import derivative
 
 # Of the numbers of the model those that say nothing of how wheels move, but what is felt, sensed and slips.
 OF_NO_MOTION = frozenset((
-    "gain", "torque_lag", "unreported", "tyres", "damping_time", "softness", "imu_position", "imu_height", "gyro_bias",
-    "gyro_scale", "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock", "tracked",
+    "gain", "crosstalk", "coupling", "torque_lag", "unreported", "tyres", "damping_time", "softness", "imu_position",
+    "imu_height", "gyro_bias", "gyro_scale", "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock", "tracked",
 ))  # fmt: skip
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
@@ -228,7 +228,9 @@ class ModelNumbers:
         chassis: (4,) as in `dynamic_parameters`; modules: (n, 9) likewise; com_height: [m].
         steer_axis, caster_offset, radius: geometry (n, 2), (n, 2), (n,).
         steer_zero: error of the measured headings (n,) [rad].
-        gain: true over reported motor torque (n, 2).
+        gain: true over reported torque of each motor (n, 2); crosstalk: part of a drive's reported torque that its steering
+            gives besides (n,).
+        coupling: of the gears, see `RobotDescription.gear_coupling` (n, 2, 2).
         imu_position: (2,) [m]; imu_height: above the floor [m]; gyro_bias [rad/s]; gyro_scale;
             accelerometer_bias: (2,) [m/s^2]; accelerometer_scale: (2,).
         axle: fixed axles (k, 3), k of 0 or 1: their middle [m] and heading [rad].
@@ -257,6 +259,8 @@ class ModelNumbers:
     radius: FloatArray
     steer_zero: FloatArray
     gain: FloatArray
+    crosstalk: FloatArray
+    coupling: FloatArray
     imu_position: FloatArray
     imu_height: float
     gyro_bias: float
@@ -326,6 +330,8 @@ class ModelNumbers:
             radius=robot.wheel_radius.copy(),
             steer_zero=np.zeros(robot.n),
             gain=np.ones((robot.n, 2)),
+            crosstalk=np.zeros(robot.n),
+            coupling=robot.gear_coupling,
             imu_position=np.array(imu.position[:2]) if imu else np.zeros(2),
             imu_height=imu.position[2] if imu else 0.0,
             gyro_bias=0.0,
@@ -889,9 +895,20 @@ def added_torque(motion: RobotMotion, numbers: ModelNumbers, around: Surrounding
     # What is scaled, and what makes wheels slip, is the torque without the noise of its report: with it gains, and loads of
     # tyres, would be found as small, or as large, as makes that noise least.
     added = np.zeros_like(motion.torque) if around.torque is None else around.torque.copy()
-    added += (numbers.gain - 1.0) * motion.balanced_torque + numbers.torque_lag * motion.torque_rate
+    added += _scaled_by_motors(motion.balanced_torque, numbers) + numbers.torque_lag * motion.torque_rate
     if numbers.unreported.any():
         added += np.sum(numbers.unreported * motion.loops, axis=3)
+    return added
+
+
+def _scaled_by_motors(torque: FloatArray, numbers: ModelNumbers) -> FloatArray:
+    """What motors give more than they report on joints (T, n, 2): a motor's own error reaches both where gears are coupled."""
+    errors = numbers.gain - 1.0
+    if not numbers.coupling[:, [0, 1], [1, 0]].any():
+        return errors * torque
+    more = np.einsum("nij,nj,njk->nik", np.linalg.inv(numbers.coupling), errors, numbers.coupling)
+    more[:, DRIVE, STEER] += numbers.crosstalk
+    added: FloatArray = np.einsum("tni,nik->tnk", torque, more)
     return added
 
 

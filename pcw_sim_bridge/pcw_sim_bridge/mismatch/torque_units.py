@@ -21,6 +21,7 @@ from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 from .held_commands import held_commands
 from .regression_problem import FloatArray, RegressionProblem
 from .reported_torques import unlikely_factor
+from .robot_nuisances import CROSSTALK
 
 TORQUE_CONSTANT = "torque_constant_error"
 FRICTIONS = ("drive_coulomb_friction", "drive_viscous_friction", "steer_coulomb_friction", "steer_viscous_friction")
@@ -106,6 +107,12 @@ def _gains(robot: RobotDescription, problem: RegressionProblem) -> FloatArray | 
     # Joints that rub, one or all, need many times the torque that moves the robot, and are no joints in other units.
     parts = [term.columns(term.shapes[0])[:, :, list(term.base_indices())] for term in (*both, *rubbing)]
     columns = np.concatenate(parts, axis=2)
+    # Reports are of joints, and a motor's error reaches both of these where their gears are coupled.
+    numbers = {number.name: number.column for number in problem.nuisances}
+    for name, coupling in zip(robot.caster_names, robot.gear_coupling, strict=True):
+        crossed = coupling[0, 1] * numbers.get(f"{CROSSTALK}/{name}", 0.0)
+        columns[:, :, 0] -= crossed
+        columns[:, :, 1] += crossed
     rows, left = [], []
     for c in force:
         valid = problem.valid[:, c]

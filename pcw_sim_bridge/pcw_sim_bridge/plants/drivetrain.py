@@ -63,13 +63,24 @@ def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def
     gears, coupling, gear_state = effects.gears, effects.coupling, effects.gear_state
     kernels, numbers = effects.joint_kernels, effects.joint_numbers
     tau_rho, tau_phi, s_rr, s_rp, s_pp = 0.0, 0.0, 0.0, 0.0, 0.0
+    # Torques of the motors, each on its own shaft, joint side: tau = E^T u with the rows E of the coupling.
+    e01, e10 = coupling[i, 0, 1], coupling[i, 1, 0]
+    determinant = 1.0 - e01 * e10
+    shaft_0 = (wheel[MOTOR_RHO] - e10 * wheel[MOTOR_PHI]) / determinant
+    shaft_1 = (wheel[MOTOR_PHI] - e01 * wheel[MOTOR_RHO]) / determinant
     on_motor_0, on_motor_1, motor_slope_0, motor_slope_1 = 0.0, 0.0, 0.0, 0.0
     for k in range(effects.joint_start[i], effects.joint_start[i + 1]):
         axis = effects.joint_place[k, 0]
-        on_motor = effects.joint_place[k, 1] == 1 and gears[i, axis, GEAR] > 0.0
-        angle = gear_state[i, axis, ANGLE] if on_motor else wheel[RHO + axis]
-        rate = gear_state[i, axis, RATE] if on_motor else wheel[RHO_DOT + axis]
-        torque, slope = kernels[k](angle + 0.5 * dt * rate, rate, wheel[MOTOR_RHO + axis], normal, numbers[k])
+        on_motor = effects.joint_place[k, 1] == 1
+        angle, rate, motor = wheel[RHO + axis], wheel[RHO_DOT + axis], wheel[MOTOR_RHO + axis]
+        if on_motor:
+            motor = shaft_0 if axis == 0 else shaft_1
+            if gears[i, axis, GEAR] > 0.0:
+                angle, rate = gear_state[i, axis, ANGLE], gear_state[i, axis, RATE]
+            else:
+                angle = coupling[i, axis, 0] * wheel[RHO] + coupling[i, axis, 1] * wheel[PHI]
+                rate = coupling[i, axis, 0] * wheel[RHO_DOT] + coupling[i, axis, 1] * wheel[PHI_DOT]
+        torque, slope = kernels[k](angle + 0.5 * dt * rate, rate, motor, normal, numbers[k])
         slope = max(slope, 0.0)
         if on_motor and axis == 0:
             on_motor_0 += torque
@@ -83,22 +94,15 @@ def joint_torques(i, dt, wheel, normal, effects):  # type: ignore[no-untyped-def
         else:
             tau_phi += torque
             s_pp += slope
-    if gears[i, 0, GEAR] == 0.0 and gears[i, 1, GEAR] == 0.0:
-        return tau_rho + wheel[MOTOR_RHO], tau_phi + wheel[MOTOR_PHI], s_rr, s_rp, s_pp
-    # Torques of the motors, each on its own shaft, joint side: tau = E^T u with the rows E of the coupling.
-    e01, e10 = coupling[i, 0, 1], coupling[i, 1, 0]
-    determinant = 1.0 - e01 * e10
-    shaft_0 = (wheel[MOTOR_RHO] - e10 * wheel[MOTOR_PHI]) / determinant
-    shaft_1 = (wheel[MOTOR_PHI] - e01 * wheel[MOTOR_RHO]) / determinant
     for axis in range(2):
         row_rho, row_phi = coupling[i, axis, 0], coupling[i, axis, 1]
-        shaft = shaft_0 if axis == 0 else shaft_1
-        slope = 0.0
+        shaft = shaft_0 + on_motor_0 if axis == 0 else shaft_1 + on_motor_1
+        slope = motor_slope_0 if axis == 0 else motor_slope_1
         if gears[i, axis, GEAR] > 0.0:
             shaft, slope = _gear_torque(
                 dt,
-                shaft + (on_motor_0 if axis == 0 else on_motor_1),
-                motor_slope_0 if axis == 0 else motor_slope_1,
+                shaft,
+                slope,
                 row_rho * wheel[RHO] + row_phi * wheel[PHI],
                 row_rho * wheel[RHO_DOT] + row_phi * wheel[PHI_DOT],
                 gears[i, axis],

@@ -74,7 +74,7 @@ class EffectTables:
         memory_start: (k + 1,), which part of `memory` each actuator has.
         memory: what actuators remember.
         gears: (n, 2, GEAR_NUMBERS).
-        coupling: motor angles, joint side, from joint angles: rows of the gear matrix over its diagonal (n, 2, 2).
+        coupling: of the robot's gears, see `RobotDescription.gear_coupling` (n, 2, 2).
         gear_state: (n, 2, GEAR_STATE).
         gravity: (3,) [m/s^2], world axes.
         compiled: the same tables, as compiled code takes them.
@@ -141,9 +141,8 @@ class EffectTables:
         self.memory = np.zeros(max(int(self.memory_start[-1]), 1))
 
     def _collect_gears(self, robot: RobotDescription) -> None:
-        gear_matrix = robot.gear_matrix
-        diagonal = np.einsum("nii->ni", gear_matrix)
-        self.coupling = np.ascontiguousarray(gear_matrix / diagonal[:, :, None])
+        diagonal = np.einsum("nii->ni", robot.gear_matrix)
+        self.coupling = robot.gear_coupling.copy()
         self.gears = np.zeros((robot.n, 2, GEAR_NUMBERS))
         self.gear_state = np.zeros((robot.n, 2, GEAR_STATE))
         for instance in robot.physics:
