@@ -494,13 +494,28 @@ def test_what_held_out_data_refuse_is_in_the_verdict() -> None:
 def test_numbers_that_no_healthy_robot_has_are_in_the_verdict(tmp_path: Path) -> None:
     """A torque constant thirteen tolerances off was said to be "within noise and tolerances"."""
     strained = dataclasses.replace(demo_findings().retuned[0], value=68.0, healthy=2.22)
-    nothing = {"verdict": "no_mismatch", "effects": (), "locations": (), "unknown": ()}
+    quiet = tuple(dataclasses.replace(channel, flagged=False) for channel in demo_findings().channels)
+    nothing = {"verdict": "no_mismatch", "effects": (), "locations": (), "unknown": (), "channels": quiet}
     findings = dataclasses.replace(demo_findings(), **nothing, retuned=(strained,))
     text = "no effect is missing, but the description is off by more than its tolerances in chassis.mass (8.1 tolerances)"
     assert findings.summary()[1] == f"Verdict:   {text}"
     assert text[0].upper() + text[1:] in write_report(findings, None, tmp_path / "report").read_text(encoding="utf-8")
     healthy = dataclasses.replace(findings, retuned=(dataclasses.replace(strained, value=75.0),))
     assert "within noise and tolerances" in healthy.summary()[1]
+
+
+@pytest.mark.parametrize(("count", "more"), [(1, ""), (3, ""), (5, " and 2 more channels")])
+def test_what_noise_does_not_explain_and_no_name_either_is_in_the_verdict(count: int, more: str) -> None:
+    """All five robots of eight draws of the challenge with something missing that was too little to name had flagged channels,
+    and 92 of 96 healthy ones had none: "nothing is missing: what differs is within noise and tolerances".
+    """
+    channels = tuple(ChannelFinding(f"channel_{k}", "N", 1.0, 0.1, 1e-6, k < count) for k in range(6))
+    findings = minimal_findings("no_mismatch", channels=channels)
+    told = ", ".join(f"channel_{k}" for k in range(min(count, 3)))
+    assert findings.nothing_missing().endswith(f", but noise and tolerances alone do not explain {told}{more}")
+    assert findings.nothing_missing().startswith("no effect stands out")
+    quiet = tuple(dataclasses.replace(channel, flagged=False) for channel in channels)
+    assert "nothing is missing" in dataclasses.replace(findings, channels=quiet).nothing_missing()
 
 
 def test_unknown_verdict_is_refused(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ FORMAT = "pcw_mismatch/1"
 FLAG_PROBABILITY = 1e-3  # of a channel's residual being noise and tolerances, below which it departs
 VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
 REFUSED = "fitted but did not help held out"  # an outcome of the ladder
+FEW_CHANNELS = 3  # that are told by name in a sentence
 SHORT_ENOUGH = 100  # characters of a formula that stands in a plain sentence
 
 
@@ -395,11 +396,17 @@ class Findings:
         if refused:  # nothing proved, which is not the same as nothing there
             where += f" that held-out data bear out; the fitted recordings alone speak for {', '.join(refused)}"
         strained = [f"{number.name} ({number.times:.1f} tolerances)" for number in self.retuned if number.strained]
-        if refused and not strained:
-            return f"no effect is missing{where}"
-        if not strained:
+        beyond = [channel.name for channel in self.channels if channel.flagged]
+        if not (refused or strained or beyond):
             return f"nothing is missing{where}: what differs is within noise and tolerances"
-        return f"no effect is missing{where}, but the description is off by more than its tolerances in {', '.join(strained)}"
+        reasons = []
+        if strained:
+            reasons.append(f"the description is off by more than its tolerances in {', '.join(strained)}")
+        if beyond:  # too little to name what it is, and too much for nothing
+            more = f" and {len(beyond) - FEW_CHANNELS} more channels" if len(beyond) > FEW_CHANNELS else ""
+            reasons.append(f"noise and tolerances alone do not explain {', '.join(beyond[:FEW_CHANNELS])}{more}")
+        what = "no effect stands out" if beyond else "no effect is missing"
+        return f"{what}{where}{', but ' if reasons else ''}{', and '.join(reasons)}"
 
     def _doubt(self, effect: EffectFinding) -> str:
         """What else a named effect may be, as words after its statement."""
