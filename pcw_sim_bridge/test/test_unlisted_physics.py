@@ -38,7 +38,7 @@ from pcw_sim_bridge.mismatch.explanation import Estimate, NamedTerm
 from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
 from pcw_sim_bridge.mismatch.law_search import _Screened
 from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier, plain_expression, plain_forms
-from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Sites, Term
+from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, LinearParameter, Sites, Term
 from pcw_sim_bridge.mismatch.report import write_report
 from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
 from pcw_sim_bridge.mismatch.rollout import HORIZONS
@@ -473,6 +473,27 @@ def test_two_laws_are_no_torque_constants_to_be_doubted():
     nothing = np.zeros((1, 1))
     laws = [NamedTerm(Instance(k, (), ()), term, estimates, 1.0, (), 9.0, 9.0, nothing) for k, term in enumerate(terms)]
     assert explanation._doubted_by_scale(laws) == tuple(laws)
+
+
+@pytest.mark.parametrize(
+    ("target", "axis", "active", "doubted"),
+    [(("a",), None, (0,), True), (("a",), "steer", (0,), False), (("b",), None, (0,), False), (("a",), None, (0, 1), False)],
+)
+def test_a_constant_load_beside_dry_friction_may_be_a_friction_of_two_sizes(target, axis, active, doubted):
+    """It is the same torque; an asymmetric friction was told as a friction and a load, both for sure."""
+    size = [LinearParameter(name, "N m", -1.0, 1.0, 1.0) for name in ("coulomb", "asymmetry", "load")]
+    nothing = np.zeros((1, 1))
+    entries = [
+        NamedTerm(Instance(k, (), on), term, {}, 1.0, (), 9.0, 9.0, nothing)
+        for k, (on, term) in enumerate([
+            (active, Term("drive_coulomb_friction", ("a",), tuple(size[:2]), ({},), lambda shape: nothing[None])),
+            ((0,), Term("constant_load", target, (size[2],), ({},), lambda shape: nothing[None], axis=axis)),
+            ((), Term(UNKNOWN, target, (), ({},), lambda shape: nothing[None])),
+        ])
+    ]
+    rubbing, load, law = explanation._doubted_beside_friction(entries)
+    assert (rubbing, law) == (entries[0], entries[2])
+    assert (load.ambiguous_with, load.probability) == ((("drive_coulomb_friction",), 0.5) if doubted else ((), 1.0))
 
 
 def test_a_file_passes_the_checks_of_the_house(tmp_path):

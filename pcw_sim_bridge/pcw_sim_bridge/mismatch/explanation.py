@@ -691,7 +691,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
                 contribution,
             )
         )
-    doubted = _doubted_by_scale(named)
+    doubted = _doubted_beside_friction(_doubted_by_scale(named))
     doubtful = set(OF_THE_BALANCE if strained_of_the_balance(problem, selection.fit) else ())
     doubtful |= set(OF_ROLLING if cannot_contradict(problem) else ())
     return tuple(
@@ -756,6 +756,28 @@ def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
             # Which of them, the recordings do not say.
             probability = min(entry.probability, 1.0 / (1.0 + len(alike)))
             doubted[index] = dataclasses.replace(entry, ambiguous_with=ambiguous, probability=probability)
+    return tuple(doubted)
+
+
+def _doubted_beside_friction(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
+    """Say of a constant load on a caster's joint that rubs that it is what a Coulomb friction does which has two sizes.
+
+    -c sign(q_dot) - l is a friction of c + l one way and c - l the other; which it is, no recording says.
+    """
+    rubs: dict[tuple[tuple[str, ...], str | None], str] = {}
+    for entry in named:
+        numbers = {parameter.name: k for k, parameter in enumerate(entry.term.parameters)}
+        if {"coulomb", "asymmetry"} <= numbers.keys() and numbers["asymmetry"] not in entry.instance.active:
+            rubs[entry.term.target, _axis(entry.term)] = entry.term.effect
+    doubted = []
+    for entry in named:
+        term, friction = entry.term, None
+        if term.effect == "constant_load" and term.target != ("axis",):
+            friction = rubs.get((term.target, _axis(term)))
+        if friction is not None:
+            ambiguous = tuple(dict.fromkeys((*entry.ambiguous_with, friction)))
+            entry = dataclasses.replace(entry, ambiguous_with=ambiguous, probability=min(entry.probability, 0.5))
+        doubted.append(entry)
     return tuple(doubted)
 
 
