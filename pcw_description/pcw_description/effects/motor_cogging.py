@@ -1,4 +1,4 @@
-"""Cogging of a motor: a torque periodic in the angle of the joint."""
+"""Cogging of a motor: a torque periodic in its angle, joint side."""
 
 import math
 
@@ -10,7 +10,7 @@ from .kinds import JointTorqueEffect
 
 @compiled_joint_torque
 def cogging_torque(position, velocity, motor_torque, normal_force, parameters):  # type: ignore[no-untyped-def]
-    """Return cosine cos(k q) + sine sin(k q), k periods per radian of the joint [N m]."""
+    """Return cosine cos(k q) + sine sin(k q), k periods per radian of the motor, joint side [N m]."""
     angle = parameters[2] * position
     return parameters[0] * math.cos(angle) + parameters[1] * math.sin(angle), 0.0
 
@@ -26,7 +26,7 @@ EFFECT = JointTorqueEffect(
     parameters=(
         EffectParameter("cosine", "N m", "cosine part of the ripple", -1e4, 1e4, 0.2, linear=True),
         EffectParameter("sine", "N m", "sine part of the ripple", -1e4, 1e4, 0.2, default=0.0, linear=True),
-        EffectParameter("order", "1/rad", "ripple periods per turn of the joint", 0.05, 1e5, 40.0),
+        EffectParameter("order", "1/rad", "ripple periods per radian of the motor, joint side", 0.05, 1e5, 40.0),
     ),
     sensors=("joint_states",),
     look_alikes=("wheel_eccentricity",),

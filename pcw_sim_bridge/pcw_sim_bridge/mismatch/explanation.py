@@ -656,8 +656,8 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             variance = max(float(covariance[np.ix_(parts, parts)].sum()) for covariance in (known.covariance, misfit))
             power = problem.powers.get((instance.term, instance.shape, parameter_index), 1.0)
             within = search.taken_over.get((instance.term, parameter_index), 0.0)
-            parts_of_it = (problem.scale_deviation / power * value, term.unsure.get(parameter.name, 0.0) * value)
-            half = HALF_WIDTH * math.hypot(math.sqrt(variance), within, *parts_of_it)
+            relative = math.hypot(problem.scale_deviation / power, term.unsure.get(parameter.name, 0.0))
+            half = HALF_WIDTH * math.hypot(math.sqrt(variance), within, relative * value)
             low, high = parameter.interval(value - half, value + half)
             estimates[parameter.name] = Estimate(parameter.value(value), parameter.unit, low, high)
         others = fit.instances[:index] + fit.instances[index + 1 :]

@@ -64,7 +64,7 @@ class Looked:
         left: over its noise, tolerances fitted, zero where it is not to be judged (T, C); deviation: that noise (C,).
         valid: samples that may be judged (T, C).
         time: since each recording's start (T,) [s]; recording: the number of that (T,); rate: samples per second.
-        angle: of every joint (T, n, 2) [rad].
+        angle: of every motor, joint side (T, n, 2) [rad].
         places: of the wheels' centres in the world (T, n, 2) [m]; heading: of the wheels there (T, n) [rad].
     """
 

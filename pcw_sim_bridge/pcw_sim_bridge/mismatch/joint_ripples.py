@@ -1,9 +1,10 @@
 """Ripples that turn with a joint, told at the full rate of its encoder.
 
 The channels end at some hertz, where accelerations drown in noise. A ripple of a quickly turning motor passes faster than
-that, and would be seen by nobody. But it keeps step with the angle of its joint whatever the speed, and with nothing else:
+that, and would be seen by nobody. But it keeps step with the angle of its motor whatever the speed, and with nothing else:
 
-    P(k) = | sum_t y(t) exp(-i k q(t)) |^2 ,     y: torque or rate of the joint above the channels' band, q: its angle [rad]
+    P(k) = | sum_t y(t) exp(-i k q(t)) |^2 ,     y: torque or rate of the joint above the channels' band,
+                                                 q: angle of its motor, joint side [rad]
 
 has a line at its order k. A loop that rings has none as soon as the speed changes, and a wheel that shakes because another
 motor ripples keeps step with that one's angle better than with its own. Orders below `LEAST_ORDER` are those of wheels and
@@ -67,7 +68,7 @@ class JointRipple:
 
 @dataclasses.dataclass(frozen=True)
 class _Band:
-    """What a joint does above the channels' band: a signal and its angle (T,), and its speed below it (T,) [rad/s]."""
+    """What a joint does above the channels' band: a signal, its motor's angle (T,), and its speed below it (T,) [rad/s]."""
 
     caster: str
     axis: str

@@ -208,7 +208,7 @@ class RippleScale:
         # A row is held until the next. What acts meanwhile is the mean of both, unless torques are of another instant.
         later = 0.5 + point[-1]
         torque = (1.0 - later) * windows.torque[:, :-1] + later * windows.torque[:, 1:]
-        row = as_it_really_is(robot).gear_coupling[i, k]
+        row = robot.gear_coupling[i, k]
         turned = 0.5 * self._order(point) * ((windows.angle[:, :-1, i] + windows.angle[:, 1:, i]) @ row)
         torque[:, :, i] += (point[0] * np.cos(turned) + point[1] * np.sin(turned))[:, :, None] * row
         _, joints = plant.roll_out(torque, substeps, starts, list(range(1, torque.shape[1] + 1)))

@@ -169,8 +169,8 @@ class RobotProblemBuilder:
         places, headings = self._wheels()
         shaken, limited = self._shaken(), self._at_the_limit(differences)
         if with_terms:
-            motors = np.swapaxes(self.robot.gear_coupling, 1, 2)  # what ripples over an angle is a motor
-            angle = differences.filtered([np.einsum("tni,nik->tnk", motion.position, motors) for motion in self.motions])
+            coupling = self.robot.gear_coupling  # what ripples over an angle is a motor
+            angle = differences.filtered([np.einsum("nki,tni->tnk", coupling, motion.position) for motion in self.motions])
             left, deviation = remainder(differences.residual, valid, nuisances)
             looked = Looked(left, deviation, valid, time, recording, rate, angle, places, headings)
             terms = tuple(robot_terms(self.robot, differences, looked, bool(self._leads.any()), keys))

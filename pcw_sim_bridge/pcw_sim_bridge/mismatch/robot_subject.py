@@ -368,7 +368,8 @@ def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> Robo
     Args:
         robot: the robot.
         retuned: by the names that the findings give them. Wheels read turned, torque constants and the floor's slope are no
-            numbers of a description and become effects; what an IMU or a clock says moves no robot and changes nothing.
+            numbers of a description and become effects; what an IMU or a clock says moves no robot and changes nothing, and no
+            effect stands for a crosstalk of reported torques.
     """
     chassis = robot.chassis
     x, y, z = chassis.com
