@@ -232,7 +232,7 @@ def test_a_doubted_effect_may_be_a_part_of_one_that_is_felt_there(other: str, ta
     doubted = EffectFinding("x", ("rear_left",), 0.5, {}, "It is x.", ("payload_mass",), None)
     beside = EffectFinding(other, (target,), 1.0, {}, "And more.", (), None)
     summary = "\n".join(minimal_findings("explained", effects=(doubted, beside)).summary())
-    assert f"It is x. (It may as well be {said}.)" in summary
+    assert f"It is x. (It may as well be {said}.) (Probability 0.50.) And more.\n" in summary
 
 
 @pytest.mark.parametrize(

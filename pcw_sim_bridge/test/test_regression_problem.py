@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch, Selection
+from pcw_sim_bridge.mismatch.evidence_selection import BELOW_DETAILS, EffectSearch, Selection
 from pcw_sim_bridge.mismatch.explanation import _telling, explain, named_terms, search_effects
+from pcw_sim_bridge.mismatch.findings import FLAG_PROBABILITY
 from pcw_sim_bridge.mismatch.held_out import HeldOut
+from pcw_sim_bridge.mismatch.nearest_effect import with_the_nearest
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, shared_beliefs
 from pcw_sim_bridge.mismatch.regression_problem import (
@@ -606,13 +608,20 @@ def test_a_small_effect_that_no_error_of_the_model_looks_like_counts(drift, name
     assert chosen(dataclasses.replace(problem, drifts=drifts)) == named
 
 
-@pytest.mark.parametrize("size", [0.0, 0.05])
-def test_what_comes_nearest_to_a_name_is_told(size):
-    """49 nats were refused for what the model itself misjudges, and no word of them stood beside "nothing is missing"."""
+@pytest.mark.parametrize(
+    ("size", "drift", "named"), [(0.0, True, []), (0.05, False, []), (0.05, True, ["ripple"])]
+)
+def test_what_comes_nearest_to_a_name_is_told(size, drift, named):
+    """49 nats were refused for what the model itself misjudges, and no word of them stood beside "nothing is missing".
+
+    Where the model says what it misjudges, and more than noise is left, it is named with half the belief.
+    """
     time = np.arange(3000) / RATE
     noise = 0.01 * np.random.default_rng(4).standard_normal(len(time))
     column = np.sin(7.0 * time)
     problem = linear_problem(size * column + noise, {"ripple": (column, 100.0)})
+    if drift:
+        problem = dataclasses.replace(problem, drifts=np.stack([np.sin(time), column], axis=1)[:, None, :])
     explanation = explain(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
     nearest = explanation.nearest()
     assert explanation.named == ()
@@ -620,7 +629,38 @@ def test_what_comes_nearest_to_a_name_is_told(size):
         assert nearest is None
     else:
         assert nearest is not None and "ripple" in nearest.description and nearest.gain > 9.0
-        assert nearest.outcome == "below the details that remain"
+        assert nearest.outcome == BELOW_DETAILS
+        assert explanation.p_values[0] < FLAG_PROBABILITY
+    doubted = with_the_nearest(explanation)
+    assert [entry.term.effect for entry in doubted.named] == named
+    assert all(0.1 < entry.probability <= 0.5 for entry in doubted.named)
+    assert bool(named) == any("ripple/axis does less than what the model" in said for said in doubted.remarks)
+
+
+@pytest.mark.parametrize(("alike", "ambiguous"), [(1.0, True), (0.3, False)])
+def test_motors_of_all_steerings_may_be_those_of_all_drives_and_a_load(alike: float, ambiguous: bool):
+    """Motors and a payload that undo each other in the forces were, for certain, steerings that were too weak."""
+    time = np.arange(800) / RATE
+    noise = 2.0 * np.random.default_rng(3).standard_normal(len(time))
+    drives, load = np.sin(2.1 * time), np.sin(3.3 * time)
+    columns = {"steerings": drives + load, "drives": drives, "load": alike * load + (1.0 - alike) * np.sin(5.1 * time)}
+    problem = linear_problem(0.8 * columns["steerings"] + noise, {name: (column, 100.0) for name, column in columns.items()})
+    casters, motors = ("left", "rear", "right"), "torque_constant_error"
+    size = (LinearParameter("size", "1", -100.0, 100.0, 0.8),)
+    problem = dataclasses.replace(
+        problem,
+        terms=tuple(
+            dataclasses.replace(term, effect=effect, target=target, axis=axis, parameters=size)
+            for term, effect, target, axis in zip(
+                problem.terms, (motors, motors, "payload_mass"), (casters, casters, ("chassis",)), ("steer", "drive", None),
+                strict=True,
+            )
+        ),
+    )  # fmt: skip
+    (entry,) = explain(problem, np.random.default_rng(0), SelectionSettings(surrogates=20)).named
+    assert entry.term.axis == "steer"
+    assert ("payload_mass" in entry.ambiguous_with) == ambiguous
+    assert entry.probability <= 0.5 if ambiguous else entry.probability > 0.9
 
 
 def test_what_a_gate_stops_gives_way_to_its_like_that_passes():

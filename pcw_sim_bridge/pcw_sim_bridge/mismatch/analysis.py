@@ -42,6 +42,7 @@ from .findings import (
 from .generated_effect import NoSuchKernelError, generate
 from .late_torques import TORQUE_LAG, with_late_torques, without_late_reports
 from .locations import locate, locate_leftover, walked
+from .nearest_effect import with_the_nearest
 from .open_set import Leftover
 from .proof import Proof, Prover, with_channels
 from .regression_problem import HEALTHY, STRAINED, TAKEN_OVER, FloatArray, RegressionProblem
@@ -162,7 +163,7 @@ def analyse(
         return command_findings(fitted, others, seed, settings, progress), fitted, prover, subject.responses(opened)
 
     explanation, (commands, commanded, prover, responses) = side_by_side(
-        lambda: explain(problem, np.random.default_rng(seed), settings, progress), needs_no_explanation
+        lambda: with_the_nearest(explain(problem, np.random.default_rng(seed), settings, progress)), needs_no_explanation
     )
     commands = without_late_reports(with_late_torques(commands, commanded, explanation), commanded, explanation)
     progress("proving it on held-out data")

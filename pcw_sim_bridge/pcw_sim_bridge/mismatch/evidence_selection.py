@@ -51,6 +51,8 @@ HIDDEN_WAVE = -2.0  # nats that a wave of a first look costs at most to be searc
 REPLACED_ODDS = -1.0
 # So often a chosen set is asked whether something that was dropped should come back.
 SECOND_THOUGHTS = 2
+# Why an effect is refused that does less than what the model itself may misjudge.
+BELOW_DETAILS = "below the details that remain"
 # So often the outline of a patch is searched, each time from where the last one was made exact.
 OUTLINE_ROUNDS = 3
 
@@ -90,6 +92,8 @@ class EffectSearch(SetGrowth):
         self.description = problem
         # Log odds of a rival in place of a term that is named, both where they are exact: by (named, rival).
         self.where_exact: dict[tuple[int, int], float] = {}
+        # Log odds of terms together in place of one: by all that is named, what of it stays, and the terms.
+        self.odds_of_sets: dict[tuple[tuple[int, ...], ...], float] = {}
         # Outlines of patches of floor that were tried, by term.
         self.outlines: dict[int, Outlines] = {}
         # Terms that held-out recordings contradict, whatever the fitted ones say.
@@ -203,7 +207,7 @@ class EffectSearch(SetGrowth):
             own = self._exact_evidence(selection.regression, selection.fit) if own is None else own
             loss = own - self._exact_evidence(selection.regression, instead)
             if loss < selection.threshold:
-                self.note_drop(self.label(instance), loss, "re-tuning does the same")
+                self.note_drop(instance, loss, "re-tuning does the same")
                 self._exact_at(instead)
                 regression = self.whiten_beside(others)
                 return self.retuned_away(self.prune(regression, others, selection.threshold))
@@ -231,7 +235,7 @@ class EffectSearch(SetGrowth):
         if all(within):
             return selection
         index = min((k for k, inside in enumerate(within) if not inside), key=selection.losses.__getitem__)
-        self.note_drop(self.label(instances[index]), selection.losses[index], "beyond its bounds")
+        self.note_drop(instances[index], selection.losses[index], "beyond its bounds")
         others = instances[:index] + instances[index + 1 :]
         return self.bounded(self.retuned_away(self.prune(self.whiten_beside(others), others, selection.threshold)))
 
@@ -362,20 +366,55 @@ class EffectSearch(SetGrowth):
         if candidates and math.isfinite(candidates[0].gain):
             chosen = self.made_exact((*others, refined_shape(regression, others, candidates[0].instance)))
             instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)
-            there, odds = (self.problem, self._point), 0.0
-            # Which of the two leaves noise alone nobody knows: by that of either in turn.
-            for noise in (selection.regression, instead.regression):
-                self.problem, self._point = here
-                own, own_left = self._reached_with(noise, selection.fit.instances)
-                self.problem, self._point = there
-                evidence, left = self._reached_with(noise, instead.fit.instances)
-                odds += 0.5 * noise.odds(evidence - own, own_left, left)
+            there = self.place
+            odds = self._odds_there(selection, here, instead.regression, instead.fit.instances)
+            self.place = there
             said = " and ".join(map(self.label, instead.fit.instances))
             self.progress(f"{said} instead, from the beginning: log odds {odds:.1f}")
             if odds > least and any(found.term == rival for found in instead.fit.instances):
                 return instead, odds
         self.problem, self._point = here
         return selection, odds
+
+    def _odds_there(
+        self,
+        selection: Selection,
+        here: tuple[RegressionProblem, dict[object, float] | None],
+        regression: WhitenedRegression,
+        instead: tuple[Instance, ...],
+    ) -> float:
+        """Log odds of a set where the problem is exact now against a selection where it is exact; the problem stays there."""
+        there, odds = self.place, 0.0
+        # Which of the two leaves noise alone nobody knows: by that of either in turn.
+        for noise in (selection.regression, regression):
+            self.place = here
+            own, own_left = self._reached_with(noise, selection.fit.instances)
+            self.place = there
+            evidence, left = self._reached_with(noise, instead)
+            odds += 0.5 * noise.odds(evidence - own, own_left, left)
+        self.place = here
+        return odds
+
+    def odds_instead(self, selection: Selection, others: tuple[Instance, ...], rivals: Sequence[int]) -> float:
+        """Log odds of some terms together in place of what a selection has besides `others`, both where they are exact."""
+        key = (tuple(i.term for i in selection.fit.instances), tuple(i.term for i in others), tuple(rivals))
+        if key not in self.odds_of_sets:
+            here, odds = self.place, -math.inf
+            self.place = self.unexplained
+            regression, chosen = self.whiten_beside(others), others
+            for rival in rivals:
+                candidates = regression.scan(chosen, only=[rival])[0]
+                if not candidates or not math.isfinite(candidates[0].gain):
+                    break
+                chosen = (*chosen, refined_shape(regression, chosen, candidates[0].instance))
+            else:
+                chosen = self.made_exact(chosen)
+                regression = self.whiten_beside(chosen)
+                if regression.within_bounds(regression.fit(chosen)):
+                    odds = self._odds_there(selection, here, regression, chosen)
+            self.place = here
+            self.odds_of_sets[key] = odds
+        return self.odds_of_sets[key]
 
     def against_alike(self, selection: Selection) -> Selection:
         """Exchange an effect for one that does the same to first order, where that one does more when both are exact."""
@@ -733,7 +772,7 @@ class EffectSearch(SetGrowth):
                 if loss < threshold
                 else "no gain held out"
                 if gain <= 0.0
-                else "below the details that remain"
+                else BELOW_DETAILS
                 if share < 1.0
                 else "beyond its bounds"
                 if not within
@@ -751,7 +790,7 @@ class EffectSearch(SetGrowth):
                     break
                 for instance, loss in zip(instances, losses, strict=True):
                     if instance not in needed:
-                        self.note_drop(self.label(instance), loss, "little together with others")
+                        self.note_drop(instance, loss, "little together with others")
                 instances = needed
                 self._exact_at(regression.fit(instances))
                 regression = regression.moved(self.problem)
@@ -766,7 +805,7 @@ class EffectSearch(SetGrowth):
             if loss >= threshold and self._counts_from_without(regression, instances, index):
                 kept.add(instances[index].term)
                 continue
-            self.note_drop(self.label(instances[index]), loss, reasons[index], held_out[index])
+            self.note_drop(instances[index], loss, reasons[index], held_out[index])
             point = self.problem.point
             elsewhere = point is not None and any(size.term == instances[index].term for size in point.sizes)
             dropped.add(instances[index].term)
@@ -850,10 +889,11 @@ class EffectSearch(SetGrowth):
                 break
         return None
 
-    def note_drop(self, label: str, loss: float, reason: str, held_out: float | None = None) -> None:
+    def note_drop(self, instance: Instance, loss: float, reason: str, held_out: float | None = None) -> None:
         """Put on the ladder that an effect was dropped, and why."""
+        label = self.label(instance)
         self.progress(f"- {label}: {loss:.1f} nats, {reason}")
-        self.ladder.append(LadderStep(f"drop {label}", loss, held_out, reason))
+        self.ladder.append(LadderStep(f"drop {label}", loss, held_out, reason, instance))
 
     def conclude(self, instances: Sequence[Instance], threshold: float) -> Selection:
         """Settle on a set: noise, fit and figures as they are with just these effects."""

@@ -177,7 +177,7 @@ class Explanation:
     def nearest(self) -> LadderStep | None:
         """What explained most of all that was refused although it explained enough for a name; None if nothing did."""
         steps = self.selection.ladder
-        refused = [step for step in steps if step.description.startswith("drop ") and step.gain >= self.selection.threshold]
+        refused = [step for step in steps if step.refused is not None and step.gain >= self.selection.threshold]
         return max(refused, key=lambda step: step.gain, default=None)
 
 
@@ -296,7 +296,7 @@ def _telling(search: EffectSearch, selection: Selection) -> tuple[Selection, tup
         index = int(np.argmax(alike)) if alike else 0
         if not alike or alike[index] <= MOST_ALIKE:
             return selection, entries
-        search.note_drop(search.label(entries[index].instance), entries[index].loss, f"as good as {alike[index]} others")
+        search.note_drop(entries[index].instance, entries[index].loss, f"as good as {alike[index]} others")
         rest = tuple(entry.instance for entry in entries if entry is not entries[index])
         selection = search.conclude(search.made_exact(rest), selection.threshold)
 
@@ -352,7 +352,7 @@ def _taking_over(search: EffectSearch, selection: Selection) -> Selection:
         return chosen
     search.taken_over = {}
     search.problem = search.problem.narrowed(before)
-    search.note_drop(search.label(chosen.fit.instances[tolerated]), chosen.losses[tolerated], "within the tolerances")
+    search.note_drop(chosen.fit.instances[tolerated], chosen.losses[tolerated], "within the tolerances")
     rest = chosen.fit.instances[:tolerated] + chosen.fit.instances[tolerated + 1 :]
     return _taking_over(search, search.conclude(search.made_exact(rest), selection.threshold))
 
@@ -817,6 +817,11 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
         rivals.append(regression.log_odds(usual, fit))
         if rivals[-1] > -AMBIGUOUS:
             alike.append(_called(problem.terms[own.term], problem.terms[rival.term]))
+    pair = _pair_of_the_balance(problem, others, own)
+    if pair and (odds := search.odds_instead(selection, others, pair)) > -AMBIGUOUS:
+        # That a robot carries a load besides speaks against nothing; two errors of all motors are rarer than one load.
+        rivals.append(max(odds, 0.0) if any(problem.terms[rival].effect == "payload_mass" for rival in pair) else odds)
+        alike += [_called(problem.terms[own.term], problem.terms[rival]) for rival in pair]
     for candidate in regression.scan(others)[0]:
         if (
             candidate.instance.term in {own.term, *search.contradicted}
@@ -846,6 +851,21 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
             alike.append(_called(problem.terms[own.term], problem.terms[rival_term]))
     total = sum(math.exp(min(rival, 50.0)) for rival in rivals)
     return 1.0 / (1.0 + total), tuple(alike)
+
+
+def _pair_of_the_balance(problem: RegressionProblem, others: Sequence[Instance], own: Instance) -> tuple[int, ...]:
+    """The two terms that may do together what one does: a load, all drives and all steerings share one balance of forces.
+
+    Steerings that are too weak by a part look like drives that are too strong on a robot that is heavier by as much.
+    """
+    everywhere = max(len(term.target) for term in problem.terms)
+    balance = [
+        index for index, term in enumerate(problem.terms)
+        if term.effect == "payload_mass" or (term.effect == "torque_constant_error" and len(term.target) == everywhere > 1)
+    ]  # fmt: skip
+    pair = tuple(index for index in balance if index != own.term)
+    whole = own.term in balance and len(pair) == 2 and not {other.term for other in others} & set(pair)
+    return pair if whole else ()
 
 
 def _called(own: Term, rival: Term) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .generated_effect import GeneratedEffect
@@ -16,6 +16,7 @@ FORMAT = "pcw_mismatch/1"
 FLAG_PROBABILITY = 1e-3  # of a channel's residual being noise and tolerances, below which it departs
 VERDICTS = ("no_mismatch", "explained", "partly_explained", "unexplained", "insufficient_data")
 REFUSED = "fitted but did not help held out"  # an outcome of the ladder
+SURE = 0.8  # a name of more than this probability stands for itself
 FEW_CHANNELS = 3  # that are told by name in a sentence
 SHORT_ENOUGH = 100  # characters of a formula that stands in a plain sentence
 
@@ -403,18 +404,18 @@ class Findings:
         if strained:
             reasons.append(f"the description is off by more than its tolerances in {', '.join(strained)}")
         if beyond:  # too little to name what it is, and too much for nothing
-            more = f" and {len(beyond) - FEW_CHANNELS} more channels" if len(beyond) > FEW_CHANNELS else ""
-            reasons.append(f"noise and tolerances alone do not explain {', '.join(beyond[:FEW_CHANNELS])}{more}")
+            reasons.append(f"noise and tolerances alone do not explain {some_of(beyond)}")
         what = "no effect stands out" if beyond else "no effect is missing"
         return f"{what}{where}{', but ' if reasons else ''}{', and '.join(reasons)}"
 
     def _doubt(self, effect: EffectFinding) -> str:
-        """What else a named effect may be, as words after its statement."""
+        """What else a named effect may be, and how sure it is where it is not, as words after its statement."""
         # A payload is felt by all wheels, but what is wrong with one drive is no part of what is wrong with another.
         beside = [other for other in self.effects if other is not effect]
         named = {o.name for o in beside if "chassis" in (*o.target, *effect.target) or {*o.target} & {*effect.target}}
         rivals = [f"a part of {name}" if name in named else name for name in effect.ambiguous_with]
-        return f" (It may as well be {' or '.join(rivals)}.)" if rivals else ""
+        alike = f" (It may as well be {' or '.join(rivals)}.)" if rivals else ""
+        return alike if effect.probability > SURE else f"{alike} (Probability {effect.probability:.2f}.)"
 
     def summary(self) -> list[str]:
         """Return five plain lines: subject, verdict, effects, held-out fit, warnings."""
@@ -445,3 +446,9 @@ class Findings:
             f"Held out:  {fit}",
             f"Warnings:  {warnings} about the recordings; {self.seconds:.1f} s",
         ]
+
+
+def some_of(channels: Sequence[str]) -> str:
+    """Name a few channels, and say how many more there are."""
+    more = f" and {len(channels) - FEW_CHANNELS} more channels" if len(channels) > FEW_CHANNELS else ""
+    return f"{', '.join(channels[:FEW_CHANNELS])}{more}"

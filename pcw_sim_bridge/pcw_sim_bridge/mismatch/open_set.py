@@ -288,7 +288,7 @@ def _without_mere_relief(search: EffectSearch, selection: Selection) -> Selectio
         relief = regression.tolerance_cost(rest) - regression.tolerance_cost(fit)
         loss = fit.log_evidence - rest.log_evidence
         if relief > 0.0 and loss - relief < selection.threshold:
-            search.note_drop(search.label(instance), loss, "beside the law it does no more than relieve numbers")
+            search.note_drop(instance, loss, "beside the law it does no more than relieve numbers")
             return _without_mere_relief(search, search.prune(regression, rest.instances, selection.threshold))
     return selection
 

@@ -28,12 +28,13 @@ SETTLING_ROUNDS, SETTLED = 8, 0.9
 
 @dataclasses.dataclass(frozen=True)
 class LadderStep:
-    """One line of the report's ladder: what was tried, what it gained, what became of it."""
+    """One line of the report's ladder: what was tried, what it gained, what became of it; and what it was, if refused."""
 
     description: str
     gain: float
     held_out_gain: float | None
     outcome: str
+    refused: Instance | None = None
 
 
 class SetGrowth(ExactProblem):
