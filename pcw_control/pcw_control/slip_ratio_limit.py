@@ -9,7 +9,7 @@ SCFC holds the slip that wheels do not have in common. What they have in common,
 so that lambda is drawn into the band, and within it approaches its edges no faster than at the rate k. lambda_d is a
 part of the critical slip ratio under the wheel (`critical_slip`, of the ground where nobody says). The force on the
 wheel need not be known: the sliding mode finds it. Where the slip is not known, or the estimator does not vouch for it,
-the torque stays as it was.
+the torque stays as it was. While wheels are kept in their band the integral behind the wrench that they do not make holds.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from .computed_torque import ComputedTorqueState, Demand
 from .controller_interface import (
     ControllerMeasurement,
     ControllerParameters,
+    Reference,
     joint_torque_kernel,
     parameter,
     replaced,
@@ -36,6 +37,9 @@ from .slip_constraint_force import (
     SlipConstraintForceState,
 )
 from .slip_ratio_control import SlidingWheel, SlipRatioParameters, slip_ratio_dynamics
+
+# Part of a wrench that has to be made for the integral behind it to grow.
+GIVEN = 0.9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,9 +72,10 @@ class SlipRatioLimitParameters(SlipConstraintForceParameters):
 
 @dataclasses.dataclass(frozen=True)
 class SlipRatioLimitState(SlipConstraintForceState):
-    """What SCFC remembers, and the sliding mode of every wheel (n, 4)."""
+    """What SCFC remembers, the sliding mode of every wheel (n, 4), and the error's integral before this cycle (3,)."""
 
     ratio: FloatArray
+    integral_before: FloatArray
 
 
 class SlipRatioLimit(SlipConstraintForce):
@@ -91,7 +96,17 @@ class SlipRatioLimit(SlipConstraintForce):
 
     def initial_state(self, twist: FloatArray | None = None) -> Any:
         """Return the state of a controller that takes over at a twist (3,), or at rest."""
-        return SlipRatioLimitState(**vars(super().initial_state(twist)), ratio=np.zeros((self._n, 4)))
+        return SlipRatioLimitState(
+            **vars(super().initial_state(twist)), ratio=np.zeros((self._n, 4)), integral_before=np.zeros(3)
+        )
+
+    def _demand(
+        self, state: ComputedTorqueState, measurement: ControllerMeasurement, reference: Reference, dt: float
+    ) -> tuple[ComputedTorqueState, Demand]:
+        """As of SCFC; what the integral was is kept until it is known how much of its wrench is made."""
+        after, demand = super()._demand(state, measurement, reference, dt)
+        known: Any = after
+        return replaced(known, integral_before=state.error_integral), demand
 
     def _distribute(
         self, state: ComputedTorqueState, demand: Demand, measurement: ControllerMeasurement, dt: float
@@ -103,18 +118,36 @@ class SlipRatioLimit(SlipConstraintForce):
             return replaced(before, ratio=np.zeros((self._n, 4))), F_con
         p = self.parameters.ratio
         ratio, F_con = _kept_in_band(
-            self._wheels, self._ratio_numbers, before.ratio, self._B, self._B_inverse,
+            self._wheels, self._ratio_numbers, before.ratio, self._B,
             np.ascontiguousarray(measurement.joint_velocity, dtype=np.float64),
             np.ascontiguousarray(measurement.slip, dtype=np.float64),
             self._vouched if measurement.slip_valid is None else np.ascontiguousarray(measurement.slip_valid, dtype=bool),
             self._critical if measurement.critical_slip is None else measurement.critical_slip, p.share, p.least, F_con, dt,
         )  # fmt: skip
-        return replaced(before, ratio=ratio), F_con
+        integral = _held_where_less_is_given(before.integral_before, before.error_integral, demand.A, demand.wrench, F_con)
+        return replaced(before, ratio=ratio, error_integral=integral), F_con
+
+
+@compiled
+def _held_where_less_is_given(before, integral, A, wrench, force):  # type: ignore[no-untyped-def]
+    """Return an integral (3,) as it was before where it grows and forces (n, 2) make too little of the wrench (3,).
+
+    Else what the ground did not give is asked for afterwards: a robot that stands at last drives on backwards.
+    """
+    held = integral.copy()
+    for i in range(3):
+        made = 0.0
+        for k in range(len(force)):
+            made += A[2 * k, i] * force[k, 0] + A[2 * k + 1, i] * force[k, 1]
+        grows = abs(integral[i]) > abs(before[i]) and integral[i] * wrench[i] > 0.0
+        if grows and made / wrench[i] < GIVEN:
+            held[i] = before[i]
+    return held
 
 
 @compiled
 def _kept_in_band(  # type: ignore[no-untyped-def]
-    wheels, numbers, before, B, to_force, joint_velocity, slip, vouched, critical, share, least, force, dt
+    wheels, numbers, before, B, joint_velocity, slip, vouched, critical, share, least, force, dt
 ):
     """Return the sliding modes (n, 4), and the forces (n, 2) that make the drive torques which lie within their bounds."""
     gain, sliding, layer, filter_time, least_speed = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
@@ -140,9 +173,8 @@ def _kept_in_band(  # type: ignore[no-untyped-def]
             low = min((gain * (-band - ratio) - f) / g - average, limit)
             change = min(max(drive, low), high) - drive
             drive += change
-            # The force that changes this torque and leaves the steering its own.
-            kept[i, 0] += to_force[i, DRIVE, 0] * change
-            kept[i, 1] += to_force[i, DRIVE, 1] * change
+            # The force along the wheel alone, and with it what the steering needs to hold it where it acts beside its axis.
+            kept[i, 0] += change / B[i, 0, 0]
         held = min(max(drive, -limit), limit)
         after[i, 0], after[i, 1], after[i, 2], after[i, 3] = 1.0, predicted, average, f + g * (held + w)
     return after, kept

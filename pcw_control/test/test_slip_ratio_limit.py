@@ -25,11 +25,11 @@ def test_keeps_the_controllers_contract(name):
     contract.check_contract(make_controller("slip_ratio_limit", robot), robot, np.random.default_rng(5))
 
 
-def steady(measurement):
+def steady(measurement, robot=ROBOT):
     """Torques of SCFC alone and with the limit, after the sliding mode has had 40 cycles to find the force."""
     outputs = []
     for entry in ("slip_constraint_force", "slip_ratio_limit"):
-        controller = make_controller(entry, ROBOT)
+        controller = make_controller(entry, robot)
         state = begun = controller.initial_state(np.array([0.5, 0.0, 0.0]))
         for _ in range(40):
             # The reference stays where it was: what is asked for is the same in all cycles.
@@ -81,3 +81,32 @@ def test_the_band_is_that_of_the_ground_that_is_said():
     plain = steady(rolling(slip))[0].torque[:, 0]
     np.testing.assert_array_equal(wide, plain)
     assert np.all(narrow < plain)
+
+
+def test_less_drive_needs_less_of_the_steering_where_the_wheel_stands_beside_its_axis():
+    """A brake that was let go left the steering the torque against the whole of it: the casters of such a robot swung out."""
+    robot = load_robot("tidybot2")
+    assert np.all(np.abs(robot.caster_offset[:, 1]) > 1e-3)
+    slip = np.zeros((4, 2))
+    slip[:, 0] = 0.15
+    measurement = contract.rolling_measurement(robot, [0.5, 0.0, 0.0], np.zeros(4))
+    plain, limited = steady(dataclasses.replace(measurement, slip=slip), robot)
+    change = limited.contact_force - plain.contact_force
+    assert np.all(change[:, 0] < -1.0)
+    np.testing.assert_array_equal(change[:, 1], 0.0)
+
+
+def test_what_the_ground_does_not_give_is_not_asked_for_afterwards():
+    """Braked at its limit for a second, a robot that stood at last drove on backwards, at a twelfth of its speed."""
+    controller = make_controller("slip_ratio_limit", ROBOT)
+    stop = contract.TwistReference(np.zeros(3))
+    sides = []
+    for slipping in (0.0, -0.15):
+        slip = np.zeros((4, 2))
+        slip[:, 0] = slipping
+        state = controller.initial_state(np.array([0.5, 0.0, 0.0]))
+        for _ in range(100):
+            state, _output = controller.step(state, rolling(slip), stop, DT)
+        sides.append(state.error_integral)
+    assert sides[0][0] < -0.01
+    assert abs(sides[1][0]) < 0.1 * abs(sides[0][0])
