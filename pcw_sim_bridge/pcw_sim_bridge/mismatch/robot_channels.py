@@ -27,6 +27,7 @@ from .clock_leads import clock_leads
 from .errors import MismatchError
 from .first_look import Looked, remainder
 from .found_effect import effect_instance
+from .held_steerings import held_steerings
 from .joint_balance import torque_of_motion
 from .lost_torques import by_joint, lost_torques
 from .regression_problem import (
@@ -90,6 +91,7 @@ Prepared = tuple[ChannelDifferences, BoolArray, tuple[Nuisance, ...]]
 STILL_SPEED = 0.2  # [rad/s]; joints slower than this may be held by dry friction of unknown size
 # The same of a joint that is judged by itself: slower [rad/s] for so long [s].
 HELD_SPEED, HELD_TIME = 0.05, 0.1
+WHOLE_SPEED = 0.15  # [rad/s]; from it on a dry friction that is smoothed over 0.05 rad/s is all there
 
 
 class RobotProblemBuilder:
@@ -135,6 +137,8 @@ class RobotProblemBuilder:
         # By how much clocks are ahead that are far off; columns are taken as if that were known.
         self._leads, self._said = np.zeros(2), leads
         self._seeming: ModelNumbers | None = None
+        # Steerings that dry friction holds while they stand.
+        self._held = np.zeros(robot.n, dtype=bool)
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -167,7 +171,7 @@ class RobotProblemBuilder:
         rate = float(np.mean([f.decimated_rate for f in self.filters]))
         terms: tuple[Term, ...] = ()
         places, headings = self._wheels()
-        shaken, limited = self._shaken(), self._at_the_limit(differences)
+        shaken, limited, stuck = self._shaken(), self._at_the_limit(differences), self._sticking()
         if with_terms:
             coupling = self.robot.gear_coupling  # what ripples over an angle is a motor
             angle = differences.filtered([np.einsum("nki,tni->tnk", coupling, motion.position) for motion in self.motions])
@@ -201,7 +205,7 @@ class RobotProblemBuilder:
             exact=exact,
             derive=functools.partial(self._derive, differences, terms),
             softened=self._softened if self.layout.balanced else None,
-            remarks=(*shaken, *limited),
+            remarks=(*shaken, *limited, *stuck),
             apart=self.layout.lifted,
             shaken=bool(shaken),
             limited=bool(limited),
@@ -237,8 +241,12 @@ class RobotProblemBuilder:
                 self._read = [dataclasses.replace(motion, lost=own) for motion, own in zip(self._read, lost, strict=True)]
                 self.motions = self._motions_of(self.model, leads=self._leads)
                 differences = ChannelDifferences(self.model, self.motions, self.filters)
-            self._read = with_balanced_torques(self._read, differences, self._valid(differences), instruments)
+            valid = self._valid(differences)
+            standing = [self._standing(motion)[:, STEER::2].astype(float) for motion in self.motions]
+            held = held_steerings(differences, valid, differences.filtered(standing) > 0.5, instruments)
+            self._read = with_balanced_torques(self._read, differences, valid, instruments)
             self.motions = self._motions_of(self.model, leads=self._leads)
+            self._held = held
         return self._as_read()
 
     def _as_moved(self) -> list[RobotMotion]:
@@ -436,15 +444,32 @@ class RobotProblemBuilder:
             bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
+                bad |= self._stuck(motion)
             pieces.append((bad[:, None] | ~known).astype(float))
         return (differences.filtered(pieces) < 0.1) & ~self._silent(differences)
 
-    def _standing(self, motion: RobotMotion) -> BoolArray:
+    def _stuck(self, motion: RobotMotion) -> BoolArray:
+        """Samples (T,) in which a steering that sticks stands, or turns so slowly that a smoothed friction is not whole."""
+        stuck: BoolArray = self._standing(motion, WHOLE_SPEED)[:, STEER::2][:, self._held].any(axis=1)
+        return stuck
+
+    def _standing(self, motion: RobotMotion, speed: float = HELD_SPEED) -> BoolArray:
         """Samples (T, 2n) in which a joint may be held by dry friction of unknown size: all but short moments of reversal."""
         rows = max(round(HELD_TIME * motion.rate), 1)
-        slow = np.abs(motion.velocity).reshape(len(motion.time), -1) < HELD_SPEED
+        slow = np.abs(motion.velocity).reshape(len(motion.time), -1) < speed
         held: BoolArray = ndimage.binary_opening(slow, np.ones((rows, 1), dtype=bool))
         return held
+
+    def _sticking(self) -> tuple[str, ...]:
+        """Which steerings stick, and how many samples are not judged for that."""
+        names = [name for name, held in zip(self.robot.caster_names, self._held, strict=True) if held]
+        if not names:
+            return ()
+        part = np.mean(np.concatenate([self._stuck(motion) for motion in self.motions]))
+        return (
+            f"Dry friction holds the steering of {' and '.join(names)} against whatever is applied to it while it stands. The "
+            f"{100 * part:.0f} % of the samples in which it hardly turns say nothing of torques, and were not judged.",
+        )
 
     def _silent(self, differences: ChannelDifferences) -> BoolArray:
         """Channels (C,) in which wheels say nothing of one another, such as those of one axle that never turn."""
