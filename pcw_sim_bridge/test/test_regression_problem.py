@@ -978,6 +978,23 @@ def test_an_effect_behind_a_number_that_no_healthy_system_has_is_found(off, loos
     assert any("narrower tolerances" in line for line in said) == bool(names)
 
 
+def test_an_effect_behind_a_number_with_less_room_is_known_no_better_for_it():
+    """A torque constant 15 % off was told to 0.7 %, the third of its tolerance that the number was left."""
+    time = np.arange(3000) / RATE
+    works = np.cos(0.3 * time) + 0.05 * np.sin(1.7 * time)
+    left = 0.02 * works + 0.01 * np.random.default_rng(7).standard_normal(len(time))
+    whole = linear_problem(left, {"nearly": (works, 100.0)})
+    number = dataclasses.replace(whole.nuisances[0], deviation=2e-3)
+    whole = dataclasses.replace(whole, nuisances=(number,), scale_deviation=0.0)
+    widths = []
+    for problem in (whole, whole.narrowed({"number": 0.2})):
+        search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+        [entry] = named_terms(search, search.conclude((Instance(0, (), (0,)),), 9.0))
+        widths.append(entry.estimates["size"].high - entry.estimates["size"].low)
+    assert widths[0] > 1.5 * 1.96 * 2e-3  # the number's tolerance is most of it
+    assert widths[1] == pytest.approx(widths[0], rel=0.02)
+
+
 def test_a_number_that_no_healthy_system_has_is_no_rival_held_out():
     """Twelve tolerances off it foretells other data better than an effect of which more is at work there."""
     time = np.arange(3000) / RATE

@@ -629,6 +629,20 @@ def _estimates(problem: RegressionProblem, fit: Fit) -> list[FloatArray]:
     return [fit.mean[start:stop] for start, stop in zip(ends[:-1], ends[1:], strict=True)]
 
 
+def _with_whole_tolerances(problem: RegressionProblem, covariance: FloatArray) -> FloatArray:
+    """Covariance (k, k) of a fit's numbers with the whole tolerances of those that were narrowed.
+
+    Less room for a number tells which effect it is, and nothing of how much of that lies within what a healthy robot has.
+    """
+    whole = covariance
+    for j, number in enumerate(problem.nuisances):
+        if TAKEN_OVER < number.narrowed < 1.0:
+            added = (number.narrowed**-2 - 1.0) / number.deviation**2  # precision that is none of the recording's
+            left = max(1.0 - added * whole[j, j], number.narrowed**2)
+            whole = whole + np.outer(whole[:, j], whole[:, j]) * added / left
+    return whole
+
+
 def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, ...]:
     """Numbers, intervals, probability and look-alikes of every effect of a selection."""
     # By columns of another place a payload's place would be told from the centre of mass that does the same.
@@ -637,7 +651,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
     sloped, slopes = with_slopes(problem.tangent(), fit.instances, _estimates(problem, fit), search.outlines)
     there = regression if sloped is problem else regression.moved(sloped)
     known = there.fit((*fit.instances, *slope_instances(sloped, slopes)))
-    misfit = there.misfit_covariance(known)
+    misfit, whole = there.misfit_covariance(known), _with_whole_tolerances(problem, known.covariance)
     deviations = np.sqrt(np.diag(known.covariance))
     beside_all = {(s.index, s.name): (s, float(d)) for s, d in zip(slopes, deviations[len(fit.mean) :], strict=True)}
     widening = np.maximum(np.diag(misfit) / np.maximum(np.diag(known.covariance), 1e-300), 1.0)
@@ -653,7 +667,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
                 continue
             parts = [position + offset, *(numbers.index(name) for name in numbers if name == parameter.number)]
             value = float(fit.mean[parts].sum())
-            variance = max(float(covariance[np.ix_(parts, parts)].sum()) for covariance in (known.covariance, misfit))
+            variance = max(float(covariance[np.ix_(parts, parts)].sum()) for covariance in (whole, misfit))
             power = problem.powers.get((instance.term, instance.shape, parameter_index), 1.0)
             within = search.taken_over.get((instance.term, parameter_index), 0.0)
             relative = math.hypot(problem.scale_deviation / power, term.unsure.get(parameter.name, 0.0))
