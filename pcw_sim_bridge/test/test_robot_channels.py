@@ -367,6 +367,21 @@ def test_a_law_does_where_tyres_are_softer_what_an_effect_of_the_same_torque_doe
     assert softer.sites.columns(torque)[:, :, 0] == pytest.approx(term.columns(term.shapes[0])[:, :, 0], rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.parametrize(("name", "step"), [("chassis.com.x", 1e-3), ("chassis.mass", 0.1), ("module.mass", 0.01)])
+def test_what_shifts_loads_is_felt_by_wheels_that_resist_by_them(healthy: Recording, name: str, step: float):
+    """Without it a payload's place was told from the chassis' centre of mass, with intervals that held neither."""
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
+    resistance = term_key("rolling_resistance", THESIS.caster_names)
+    [k] = [k for k, term in enumerate(problem.terms) if term.key == resistance]
+    there = problem.exact_at({}, (SizedTerm(k, (), np.array([2e-3]), (0,)),)).derived()
+    assert there.exact is not None and there.point is not None
+    less, more = (there.exact({name: side * step}, there.point.sizes)[0] for side in (-1.0, 1.0))
+    [number] = [number for number in there.nuisances if number.name == name]
+    balance = there.valid[:, :3]
+    expected, column = ((less - more) / (2.0 * step))[:, :3][balance], number.column[:, :3][balance]
+    assert np.linalg.norm(column - expected) < 1e-3 * np.linalg.norm(expected)
+
+
 def test_a_centre_of_mass_is_felt_as_a_moment_on_a_floor_that_leans(healthy: Recording) -> None:
     """Without it a payload's place was told from the chassis' centre of mass, with intervals that held neither."""
     problem = RobotProblemBuilder(THESIS, [healthy]).build()

@@ -82,6 +82,8 @@ BETWEEN_SAMPLES = 12
 # A torque by the angle may change faster than a motion is sampled: 30 ripples a turn, at one turn a second, are 30 Hz. It is
 # computed between samples and low-passed by so many taps: flat to a sixth of their rate, none left beyond six tenths of it.
 RIPPLE_TAPS, RIPPLE_CUTOFF = 96, 0.38
+# Numbers of a model that loads of wheels, and their headings, come from.
+OF_LOADS = ("chassis", "modules", "com_height", "steer_axis", "caster_offset", "radius", "steer_zero")
 
 
 def with_pose(motions: Sequence[RobotMotion], numbers: ModelNumbers) -> list[RobotMotion]:
@@ -494,6 +496,8 @@ class ChannelModel:
 
     def sides(self, motion: RobotMotion, around: Surroundings, numbers: ModelNumbers | None = None) -> Sides:
         """Measured and predicted side of every channel along a true motion, (T, C) each."""
+        if numbers is not None:
+            around = self._around_under(numbers, motion, around)
         numbers = numbers or self.numbers
         if self.layout.lifted:  # what pushes a chassis on its jack, or what it feels there, says nothing of the robot
             return joint_sides(motion, numbers, around)
@@ -502,6 +506,24 @@ class ChannelModel:
             if not isinstance(effect := get(instance.name), ClockEffect):  # a true motion has the right times
                 self._apply(motion, numbers, effect, instance.parameters, *sides)
         return sides
+
+    def _around_under(self, numbers: ModelNumbers, motion: RobotMotion, around: Surroundings) -> Surroundings:
+        """Return the surroundings with what acts on joints under the loads, and at the headings, of other numbers.
+
+        Wheels resist by their loads: a centre of mass that is elsewhere shows in that, as a payload that is elsewhere does.
+        """
+        acting = [instance for instance in self.robot.physics if isinstance(get(instance.name), JointTorqueEffect)]
+        same = all(np.array_equal(getattr(numbers, name), getattr(self.numbers, name)) for name in OF_LOADS)
+        if not acting or around.torque is None or same:
+            return around
+        change = np.zeros_like(around.torque)
+        for model, sign in ((dataclasses.replace(self, numbers=numbers), 1.0), (self, -1.0)):
+            there = dataclasses.replace(NOTHING, normal=model.normal_along(motion))
+            for instance in acting:
+                there = model.around_with(motion, there, instance)
+            if there.torque is not None:
+                change += sign * there.torque
+        return dataclasses.replace(around, torque=around.torque + change)
 
     def sides_with(self, motion: RobotMotion, around: Surroundings, plain: Sides, instance: EffectInstance) -> Sides:
         """The same with a further effect at work.
