@@ -126,7 +126,7 @@ def compile_inner_loops(nominal: RobotDescription, plant_name: str) -> None:
     odometry.update(nominal, odometry.OdometryParameters(), state, at_rest, 1.0)
     detector = SlipConsensus(nominal)
     _, finding = detector.step(detector.initial_state(), at_rest, at_rest, 0.0)
-    FaultIsolation(nominal).update(at_rest, at_rest, finding, 0.001)
+    FaultIsolation(nominal).update(at_rest, at_rest, finding, 0.001, at_rest, at_rest)
     measurement = ControllerMeasurement(at_rest, at_rest, np.zeros(3))
     controller = ComputedTorque(nominal)
     controller.step(controller.initial_state(), measurement, TwistReference(np.zeros(3)), 1.0)

@@ -13,6 +13,10 @@ second the measured speed m of each joint, and the difference of its positions, 
 A law that explains the window to within its noise, where m = p does not, is a suspicion; lasting ones are named. Slip passes
 or changes with the motion; drift and scale are named only once the motion has changed and they have not. A drive is without
 torque where the torque measured is none of that commanded. What no law explains is slip and not named here.
+
+Where gears couple drive and steering, encoders and torques are those of motors, E q_dot and E^-T tau (`gear_coupling`), and a
+fault of one motor may follow no law in the joints. There the laws are tried for joints and for motors, and what takes fewer
+faults is named; a motor's fault at the joint of its own axis.
 """
 
 from __future__ import annotations
@@ -109,6 +113,10 @@ class FaultIsolation:
         self._noise = (noise or SlipNoise.of_robot(robot)).array()
         self._geometry = (robot.steer_axis, robot.caster_offset, robot.wheel_radius)
         self._counts_noise = self._noise[:2].copy()
+        # Motors, joint side, from joints; all of them are joints where no gears are coupled.
+        self._coupling = np.ascontiguousarray(robot.gear_coupling)
+        self._torques_of_motors = np.ascontiguousarray(np.linalg.inv(self._coupling).swapaxes(1, 2))
+        self._coupled = np.any(self._coupling != np.eye(2), axis=(1, 2))
         self.reset()
 
     def reset(self) -> None:
@@ -116,11 +124,12 @@ class FaultIsolation:
         n = self.robot.n
         self._heading = np.full(n, np.nan)
         self._position = np.full((n, 2), np.nan)
-        self._sums = np.zeros((2, n, 2, _COUNT))
-        self._torque = np.zeros((n, 2, 3))
+        # First of joints, then of motors.
+        self._sums = np.zeros((2, 2, n, 2, _COUNT))
+        self._torque = np.zeros((2, n, 2, 3))
         self._elapsed = 0.0
-        self._suspicions = [[[_Suspicion() for _ in range(2)] for _ in range(n)] for _ in range(2)]
-        self._torque_suspicions = [[_Suspicion() for _ in range(2)] for _ in range(n)]
+        self._suspicions = [[[[_Suspicion() for _ in range(2)] for _ in range(n)] for _ in range(2)] for _ in range(2)]
+        self._torque_suspicions = [[[_Suspicion() for _ in range(2)] for _ in range(n)] for _ in range(2)]
 
     def update(
         self, joint_position: FloatArray, joint_velocity: FloatArray, finding: SlipFinding, dt: float,
@@ -142,13 +151,13 @@ class FaultIsolation:
         known = finding.verdict != Verdict.CANNOT_KNOW
         _compare_kernel(
             *self._geometry, np.ascontiguousarray(joint_position), np.ascontiguousarray(joint_velocity), self._position,
-            self._heading, finding.twist, finding.suspect, known, dt, self._noise, self._sums,
+            self._heading, finding.twist, finding.suspect, known, dt, self._noise, self._coupling, self._coupled, self._sums,
         )
         if effort is not None and commanded_effort is not None:
-            self._torque += dt * np.nan_to_num(
-                np.stack([np.ones(effort.shape), np.abs(effort), np.abs(commanded_effort)], axis=2)
-                * np.isfinite(effort + commanded_effort)[:, :, None]
-            )
+            _torque_kernel(
+                np.ascontiguousarray(effort), np.ascontiguousarray(commanded_effort), dt, self._torques_of_motors,
+                self._coupled, self._torque,
+            )  # fmt: skip
         self._elapsed += dt
         if self._elapsed < self.parameters.window:
             return False
@@ -162,24 +171,38 @@ class FaultIsolation:
     def faults(self) -> dict[str, Fault]:
         """Return what is at fault, by joint; {} when nothing is."""
         found: dict[str, Fault] = {}
-        for k, name in enumerate(self.robot.joint_names):
-            i, j = k // 2, k % 2
-            speed, position = (self._suspicions[source][i][j].named for source in range(2))
+        for i in range(self.robot.n):
+            of_caster = self._faults_of(i, 0)
+            if self._coupled[i]:
+                of_motors = self._faults_of(i, 1)
+                if of_motors and (not of_caster or len(of_motors) < len(of_caster)):
+                    of_caster = of_motors
+            found |= of_caster
+        return found
+
+    def _faults_of(self, i: int, motors: int) -> dict[str, Fault]:
+        """Return the faults of one caster, of its joints (0) or of its motors (1)."""
+        found: dict[str, Fault] = {}
+        for j in range(2):
+            speed, position = (self._suspicions[motors][source][i][j].named for source in range(2))
             if position is Fault.DEAD and speed is not Fault.DEAD:
                 position = Fault.STUCK  # it stays where it was, while a speed is still read
-            for fault in (position, speed, self._torque_suspicions[i][j].named):
+            for fault in (position, speed, self._torque_suspicions[motors][i][j].named):
                 if fault is not Fault.NONE:
-                    found[name] = fault
+                    found[self.robot.joint_names[2 * i + j]] = fault
                     break
         return found
 
     def _judge(self) -> None:
-        for i in range(self.robot.n):
-            for j in range(2):
-                for source in range(2):
-                    kind, number, mean = _law(self._sums[source, i, j])
-                    self._weigh(self._suspicions[source][i][j], kind, number, mean, self._sums[source, i, j])
-                self._judge_torque(i, j)
+        for motors in range(2):
+            for i in range(self.robot.n):
+                if motors and not self._coupled[i]:
+                    continue
+                for j in range(2):
+                    for source in range(2):
+                        sums = self._sums[motors, source, i, j]
+                        self._weigh(self._suspicions[motors][source][i][j], *_law(sums), sums)
+                    self._judge_torque(motors, i, j)
 
     def _weigh(self, suspicion: _Suspicion, kind: Fault | None, number: float, mean: float, sums: FloatArray) -> None:
         if kind is None:
@@ -206,11 +229,11 @@ class FaultIsolation:
         if suspicion.count >= needed:
             suspicion.named = kind
 
-    def _judge_torque(self, i: int, j: int) -> None:
-        weight, measured, commanded = self._torque[i, j]
+    def _judge_torque(self, motors: int, i: int, j: int) -> None:
+        weight, measured, commanded = self._torque[motors, i, j]
         if weight < 0.5 * self.parameters.window:
             return
-        suspicion = self._torque_suspicions[i][j]
+        suspicion = self._torque_suspicions[motors][i][j]
         if commanded / weight < self.parameters.least_torque * self.robot.torque_limit[i, j]:
             return
         if measured > 0.1 * commanded:
@@ -256,7 +279,8 @@ def _law(sums: FloatArray) -> tuple[Fault | None, float, float]:
 
 @compiled
 def _compare_kernel(  # type: ignore[no-untyped-def]
-    steer_axis, caster_offset, wheel_radius, position, velocity, before, heading, twist, suspect, known, dt, noise, sums
+    steer_axis, caster_offset, wheel_radius, position, velocity, before, heading, twist, suspect, known, dt, noise, coupling,
+    coupled, sums,
 ):  # fmt: skip
     """Add one measurement to the sums of the window; keeps the foretold headings and the last positions in place."""
     n = len(wheel_radius)
@@ -280,19 +304,53 @@ def _compare_kernel(  # type: ignore[no-untyped-def]
     # The noise of what is foretold, and not of what a faulty joint says.
     variance, _ = variance_kernel(caster_offset, wheel_radius, foretold, wanted, twist[2], noise)
     for i in range(n):
+        least = min(wheel_radius[i], abs(caster_offset[i, 0]))
+        for j in range(2):
+            variance[i, j] /= max(wheel_radius[i] if j == 0 else abs(caster_offset[i, 0]), MINIMUM_CASTER_OFFSET) ** 2
         for j in range(2):
             lever = wheel_radius[i] if j == 0 else abs(caster_offset[i, 0])
-            usable = known and lever >= MINIMUM_CASTER_OFFSET
-            p = foretold[i, j]
             for source in range(2):
-                m = velocity[i, j] if source == 0 else (position[i, j] - before[i, j]) / dt
-                if usable and math.isfinite(m):
-                    cell = sums[source, i, j]
-                    cell[_W] += dt
-                    cell[_SP] += dt * p
-                    cell[_SM] += dt * m
-                    cell[_SPP] += dt * p * p
-                    cell[_SPM] += dt * p * m
-                    cell[_SMM] += dt * m * m
-                    cell[_SVAR] += dt * variance[i, j] / (lever * lever)
+                if known and lever >= MINIMUM_CASTER_OFFSET:
+                    m = velocity[i, j] if source == 0 else (position[i, j] - before[i, j]) / dt
+                    _add(sums[0, source, i, j], foretold[i, j], m, variance[i, j], dt)
+                if known and coupled[i] and least >= MINIMUM_CASTER_OFFSET:
+                    p, m, spread = 0.0, 0.0, 0.0
+                    for k in range(2):
+                        share = coupling[i, j, k]
+                        p += share * foretold[i, k]
+                        m += share * (velocity[i, k] if source == 0 else (position[i, k] - before[i, k]) / dt)
+                        spread += share * share * variance[i, k]
+                    _add(sums[1, source, i, j], p, m, spread, dt)
+        for j in range(2):
             before[i, j] = position[i, j]
+
+
+@compiled
+def _add(cell, p, m, variance, dt):  # type: ignore[no-untyped-def]
+    """Add a foretold and a measured speed [rad/s], with its variance, to the sums of a window."""
+    if math.isfinite(m):
+        cell[_W] += dt
+        cell[_SP] += dt * p
+        cell[_SM] += dt * m
+        cell[_SPP] += dt * p * p
+        cell[_SPM] += dt * p * m
+        cell[_SMM] += dt * m * m
+        cell[_SVAR] += dt * variance
+
+
+@compiled
+def _torque_kernel(effort, commanded, dt, torques_of_motors, coupled, sums):  # type: ignore[no-untyped-def]
+    """Add time, |effort| and |commanded| of joints and of motors to the sums of the window, where both are known."""
+    for i in range(len(coupled)):
+        for motors in range(2 if coupled[i] else 1):
+            for j in range(2):
+                measured, wanted = effort[i, j], commanded[i, j]
+                if motors:
+                    measured, wanted = 0.0, 0.0
+                    for k in range(2):
+                        measured += torques_of_motors[i, j, k] * effort[i, k]
+                        wanted += torques_of_motors[i, j, k] * commanded[i, k]
+                if math.isfinite(measured + wanted):
+                    sums[motors, i, j, 0] += dt
+                    sums[motors, i, j, 1] += dt * abs(measured)
+                    sums[motors, i, j, 2] += dt * abs(wanted)

@@ -1,11 +1,14 @@
 """Which joint is at fault, and how; slip and health are no fault."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from pcw_description import load_robot
 from pcw_estimation import EstimationError, Fault, FaultIsolation, FaultParameters, SlipConsensus
 from pcw_estimation.fault_isolation import _law
+from pcw_estimation.studies.drawn_drives import DriveStyle, drawn_twist, drive
 from pcw_estimation.studies.encoder_study import drawn_scenario
 from pcw_estimation.studies.fault_study import KINDS, diagnose
 
@@ -20,6 +23,45 @@ def test_the_joint_and_its_fault_are_named_and_no_other(kind):
 
 def test_healthy_robots_have_no_fault():
     assert all(diagnose(seed, "none", duration=8.0).right for seed in range(300, 304))
+
+
+@pytest.mark.parametrize(
+    ("fault", "axis"),
+    [(Fault.DEAD, 0), (Fault.DEAD, 1), (Fault.SWAPPED, 0), (Fault.NO_TORQUE, 0), (Fault.NO_TORQUE, 1)],
+    ids=lambda each: each.name if isinstance(each, Fault) else ("drive", "steer")[each],
+)
+def test_a_fault_of_a_motor_on_coupled_gears_is_named_at_its_joint(fault, axis):
+    """A drive motor that counts nothing shows a wheel that rolls as it is steered, and a steering motor without torque leaves
+    that which the other one has on its axis: on tidybot2 neither was named.
+    """
+    robot, caster, rng = load_robot("tidybot2"), 2, np.random.default_rng(7)
+    sensors = dataclasses.replace(robot.sensors, imu=load_robot("thesis").sensors.imu)
+    twist = drawn_twist(rng, 15.0, DriveStyle())
+    driven = drive(dataclasses.replace(robot, sensors=sensors), twist, np.zeros((len(twist), robot.n, 2)), rng)
+    position, velocity = driven.position.copy(), driven.velocity.copy()
+    coupling, begins = robot.gear_coupling[caster], len(driven.stamp) // 5
+    for readings, still in ((position, 1.0), (velocity, 0.0)):
+        of_motors = readings[:, caster] @ coupling.T
+        if fault is Fault.DEAD:
+            of_motors[begins:, axis] = still * of_motors[begins, axis]
+        elif fault is Fault.SWAPPED:
+            of_motors[:, axis] *= -1.0
+        readings[:, caster] = of_motors @ np.linalg.inv(coupling).T
+    detector, isolation = SlipConsensus(robot), FaultIsolation(robot)
+    state, named = detector.initial_state(), {}
+    for k, now in enumerate(driven.stamp):
+        if k % 50 == 0:
+            commanded = rng.normal(0.0, 1.5, (robot.n, 2))
+            of_motors = np.linalg.inv(coupling).T @ commanded[caster]
+            if fault is Fault.NO_TORQUE:
+                of_motors[axis] = 0.0
+            effort = commanded.copy()
+            effort[caster] = coupling.T @ of_motors
+        dt = float(now - driven.stamp[k - 1]) if k else 0.0
+        state, finding = detector.step(state, position[k], velocity[k], dt)
+        isolation.update(position[k], velocity[k], finding, dt, effort, commanded)
+        named |= isolation.faults()
+    assert named == {robot.joint_names[2 * caster + axis]: fault}
 
 
 @pytest.mark.nightly

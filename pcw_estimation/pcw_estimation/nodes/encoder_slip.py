@@ -93,7 +93,7 @@ class EncoderSlipNode(Node):
         at_rest = np.zeros((self.robot.n, 2))
         _, finding = self._detector.step(self._detector.initial_state(), at_rest, at_rest, 0.0)
         if self._faults is not None:
-            self._faults.update(at_rest, at_rest, finding, 0.001)
+            self._faults.update(at_rest, at_rest, finding, 0.001, at_rest, at_rest)
             self._faults.reset()
 
     def _on_joint_commands(self, message: JointState) -> None:
