@@ -371,7 +371,9 @@ class EffectSearch(SetGrowth):
             self.place = there
             said = " and ".join(map(self.label, instead.fit.instances))
             self.progress(f"{said} instead, from the beginning: log odds {odds:.1f}")
-            if odds > least and any(found.term == rival for found in instead.fit.instances):
+            if not any(found.term == rival for found in instead.fit.instances):
+                odds = -math.inf  # those of a set that has come to do without it, perhaps of the old one, are not its own
+            elif odds > least:
                 return instead, odds
         self.problem, self._point = here
         return selection, odds

@@ -50,6 +50,8 @@ from .whitened_regression import Fit, Instance, WhitenedRegression
 
 # A look-alike within so many nats of a named effect cannot be told from it.
 AMBIGUOUS = 3.0
+# Nor can two effects in its place within so many: that there is one number more to choose costs about as much again.
+TWO_AMBIGUOUS = 6.0
 # What more than so many others would do as well is nothing that a name says anything of.
 MOST_ALIKE = 5
 # An effect of this part of the size that it had without a refinement was what that refinement is.
@@ -832,9 +834,11 @@ def _alternatives(search: EffectSearch, selection: Selection, index: int) -> tup
         if rivals[-1] > -AMBIGUOUS:
             alike.append(_called(problem.terms[own.term], problem.terms[rival.term]))
     pair = _pair_of_the_balance(problem, others, own)
-    if pair and (odds := search.odds_instead(selection, others, pair)) > -AMBIGUOUS:
-        # That a robot carries a load besides speaks against nothing; two errors of all motors are rarer than one load.
-        rivals.append(max(odds, 0.0) if any(problem.terms[rival].effect == "payload_mass" for rival in pair) else odds)
+    if pair and (odds := search.odds_instead(selection, others, pair)) > -TWO_AMBIGUOUS:
+        # That a robot carries a load besides speaks against nothing; two errors of all motors are rarer than one load. Two
+        # that do more, but not by the threshold, leave the one its name, and in doubt.
+        loaded = any(problem.terms[rival].effect == "payload_mass" for rival in pair)
+        rivals.append(0.0 if loaded else min(odds, 0.0))
         alike += [_called(problem.terms[own.term], problem.terms[rival]) for rival in pair]
     for candidate in regression.scan(others)[0]:
         if (

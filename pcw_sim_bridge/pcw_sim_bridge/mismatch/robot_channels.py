@@ -450,8 +450,7 @@ class RobotProblemBuilder:
 
     def _stuck(self, motion: RobotMotion) -> BoolArray:
         """Samples (T,) in which a steering that sticks stands, or turns so slowly that a smoothed friction is not whole."""
-        stuck: BoolArray = self._standing(motion, WHOLE_SPEED)[:, STEER::2][:, self._held].any(axis=1)
-        return stuck
+        return np.asarray(self._standing(motion, WHOLE_SPEED)[:, STEER::2][:, self._held].any(axis=1), dtype=bool)
 
     def _standing(self, motion: RobotMotion, speed: float = HELD_SPEED) -> BoolArray:
         """Samples (T, 2n) in which a joint may be held by dry friction of unknown size: all but short moments of reversal."""
