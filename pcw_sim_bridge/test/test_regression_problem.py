@@ -663,6 +663,22 @@ def test_motors_of_all_steerings_may_be_those_of_all_drives_and_a_load(alike: fl
     assert entry.probability <= 0.5 if ambiguous else entry.probability > 0.9
 
 
+@pytest.mark.parametrize(("rival", "tried"), [("rolling_resistance", True), ("payload_mass", False)])
+def test_look_alikes_are_tried_where_they_are_exact_though_they_are_in_proportion(rival: str, tried: bool):
+    """By a first order a rolling resistance was worth two nats less than a friction of the drives, and eleven more where exact."""
+    time = np.arange(3000) / RATE
+    noise = 0.05 * np.random.default_rng(6).standard_normal(len(time))
+    column = np.sin(2.1 * time)
+    alike = column * (1.0 + 0.002 * np.sin(0.2 * time))
+    problem = linear_problem(0.6 * column + noise, {"friction": (column, 100.0), "resistance": (alike, 100.0)})
+    terms = zip(problem.terms, ("drive_coulomb_friction", rival), strict=True)
+    problem = dataclasses.replace(problem, terms=tuple(dataclasses.replace(term, effect=effect) for term, effect in terms))
+    search = EffectSearch(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    own = Instance(0, (), (0,))
+    found = search._alike(search.conclude((own,), 9.0), (), own)
+    assert [instance.term for instance in found] == ([1] if tried else [])
+
+
 def test_what_a_gate_stops_gives_way_to_its_like_that_passes():
     """Two columns do nearly the same. That which does more holds the residual's noise and is less than that: no finding."""
     time = np.arange(3000) / RATE

@@ -498,7 +498,9 @@ class EffectSearch(SetGrowth):
         for candidate in regression.scan(others)[0]:
             if not math.isfinite(candidate.gain) or candidate.instance.term in {own.term, *self.contradicted}:
                 continue
-            if not straight and not terms[candidate.instance.term].is_curved and not terms[own.term].is_curved:
+            # Of what is in proportion a first order says all, but for what goes by loads, as masses do: look-alikes are tried.
+            curved = terms[candidate.instance.term].is_curved or terms[own.term].is_curved
+            if not (straight or curved or terms[candidate.instance.term].effect in self._look_alikes(own)):
                 continue
             if self.repeats(candidate.instance, others):
                 continue
