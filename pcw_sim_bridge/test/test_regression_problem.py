@@ -665,7 +665,7 @@ def test_motors_of_all_steerings_may_be_those_of_all_drives_and_a_load(alike: fl
 
 @pytest.mark.parametrize(("rival", "tried"), [("rolling_resistance", True), ("payload_mass", False)])
 def test_look_alikes_are_tried_where_they_are_exact_though_they_are_in_proportion(rival: str, tried: bool):
-    """By a first order a rolling resistance was worth two nats less than a friction of the drives, and eleven more where exact."""
+    """By a first order a rolling resistance was worth two nats less than a friction, and eleven more where it is exact."""
     time = np.arange(3000) / RATE
     noise = 0.05 * np.random.default_rng(6).standard_normal(len(time))
     column = np.sin(2.1 * time)
