@@ -569,7 +569,7 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
             if int(state[_CHOSEN]) >> k & 1:
                 slip_costs[k] *= RETURN_SHARE * RETURN_SHARE
     chosen, lead, searched, leapt = best_set(
-        parts, prior, started, slip_costs, cap, int(state[_CHOSEN]), state[_SINCE_SEARCH], state[_LEAD]
+        parts, prior, started, slip_costs, 1.0, cap, int(state[_CHOSEN]), state[_SINCE_SEARCH], state[_LEAD]
     )
     total = sum_of(parts, chosen)
     # The gyro helps where too few wheels roll to tell the turning rate.

@@ -3,12 +3,14 @@
 Beyond the procedure of (4.6)-(4.8), which looks at the projected residuals of one axis at a time, all 2n sensed velocities
 are weighed together. A hypothesis H names the components that slip. With the twist V that fits the others best, it costs
 
-    J(H) = 1/2 sum_(not in H) (w_i - A_i V)^2 / sigma_i^2  +  1/2 gate^2 |H|  +  min(1/2 |V - V_0|^2_P0, cap)
+    J(H) = 1/2 sum_(not in H) (w_i - A_i V)^2 / sigma_i^2  +  1/2 gate^2 c(H)  +  min(1/2 |V - V_0|^2_P0, cap)
 
 so a component belongs to H when its studentised residual exceeds `gate` (least squares with truncated cost, the consensus
-that RANSAC looks for at random). sigma_i^2 grows with speed and steering rate (`slip_noise`). V_0 is the twist before, P0
-its covariance and what traction can have changed since: of two sets of wheels that agree each among themselves, the robot
-moves with the one that goes on as before. The cap lets the other win where it needs fewer slipping components.
+that RANSAC looks for at random). c(H) counts the components, but those that say little new for less: a wheel that has
+lost its hold slips along and across, and goes on doing so. sigma_i^2 grows with speed and steering rate (`slip_noise`).
+V_0 is the twist before, P0 its covariance and what traction can have changed since: of two sets of wheels that agree each
+among themselves, the robot moves with the one that goes on as before. The cap lets the other win where it needs fewer
+slipping components.
 
 The search is exact where it matters and always the same: all sets of at most two components, all sets of casters in the
 rolling axis, in the steering axis and in both, and from the best of them single components in and out until nothing
@@ -49,6 +51,9 @@ from .slip_verdict import (
 # Part of the cost of one slipping component that a leap of the twist costs at most: with three casters one that slips must
 # still be cheaper than two, however the motion was misjudged before.
 LEAP_SHARE = 0.8
+# Parts of the cost of a slipping component: of those of a caster that is known to slip, and of the second one of a caster.
+# Where the slip of a wheel passes through zero along or across, a wheel that rolls would be as good a reason for the rest.
+SLIPPING_SHARE, SECOND_SHARE = 0.25, 0.3
 # Cost by which the best hypothesis must lead any other that is neither part of it nor the other way round: odds of 20 to 1.
 CLEAR_LEAD = 3.0
 # Logarithm of the odds, 3 to 1, by which it must be more likely that some wheels roll than that all slip.
@@ -168,8 +173,12 @@ def _step_kernel(geometry, position, velocity, dt, numbers, state):  # type: ign
             spread[i, i] += (traction * age) ** 2 + LEAST_VARIANCE
         prior = upper_inverse(spread)
     slip_cost = 0.5 * noise[7] * noise[7]
+    slip_costs = np.full(2 * n, slip_cost)
+    for i in range(n):
+        if flagged[i, 0] or flagged[i, 1]:
+            slip_costs[2 * i : 2 * i + 2] *= SLIPPING_SHARE
     chosen, lead, searched, leapt = best_set(
-        parts, prior, known, np.full(2 * n, slip_cost), LEAP_SHARE * slip_cost, int(state[CHOSEN]), state[SINCE_SEARCH],
+        parts, prior, known, slip_costs, SECOND_SHARE, LEAP_SHARE * slip_cost, int(state[CHOSEN]), state[SINCE_SEARCH],
         state[LEAD],
     )
     total = sum_of(parts, chosen)
@@ -314,21 +323,26 @@ def _size(mask):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _penalty(mask, slip_costs):  # type: ignore[no-untyped-def]
-    """Return what the components of a set cost."""
+def _penalty(mask, slip_costs, second):  # type: ignore[no-untyped-def]
+    """Return what the components of a set cost, the cheaper one of two of a caster its part `second` alone."""
     total = 0.0
-    for k in range(len(slip_costs)):
-        if mask >> k & 1:
+    for k in range(0, len(slip_costs), 2):
+        both = mask >> k & 3
+        if both & 1:
             total += slip_costs[k]
+        if both & 2:
+            total += slip_costs[k + 1]
+        if both == 3:
+            total -= (1.0 - second) * min(slip_costs[k], slip_costs[k + 1])
     return total
 
 
 @compiled
-def _climbed(parts, prior, known, slip_costs, cap, start):  # type: ignore[no-untyped-def]
+def _climbed(parts, prior, known, slip_costs, second, cap, start):  # type: ignore[no-untyped-def]
     """Return the set reached from `start` by taking single components in and out while that costs less, its cost, its leap."""
     count = len(parts) - 1
-    mask, total, penalty = start, sum_of(parts, start), _penalty(start, slip_costs)
-    cost, leapt = _cost(total, prior, known, penalty, cap)
+    mask, total = start, sum_of(parts, start)
+    cost, leapt = _cost(total, prior, known, _penalty(start, slip_costs, second), cap)
     trial = np.empty(10)
     for _ in range(2 * count):
         best, best_cost, best_leapt = -1, cost, leapt
@@ -336,36 +350,36 @@ def _climbed(parts, prior, known, slip_costs, cap, start):  # type: ignore[no-un
             sign = 1.0 if mask >> k & 1 else -1.0
             for m in range(10):
                 trial[m] = total[m] + sign * parts[k, m]
-            of_trial, trial_leapt = _cost(trial, prior, known, penalty - sign * slip_costs[k], cap)
+            of_trial, trial_leapt = _cost(trial, prior, known, _penalty(mask ^ (1 << k), slip_costs, second), cap)
             if of_trial < best_cost - 1e-9:
                 best, best_cost, best_leapt = k, of_trial, trial_leapt
         if best < 0:
             break
         mask ^= 1 << best
-        penalty = _penalty(mask, slip_costs)
         total = sum_of(parts, mask)  # added and taken out again, sums would lose digits
         cost, leapt = best_cost, best_leapt
     return mask, cost, leapt
 
 
 @compiled
-def best_set(parts, prior, known, slip_costs, cap, before, since_search, lead_before):  # type: ignore[no-untyped-def]
+def best_set(parts, prior, known, slip_costs, second, cap, before, since_search, lead_before):  # type: ignore[no-untyped-def]
     """Return the cheapest set, its lead over any other, whether it was searched for, and whether the twist leaps with it.
 
     Args:
         parts: what each component adds to the normal equations, and their sum (2n + 1, 10).
         prior: information on the twist before (6,), where it is `known`.
-        slip_costs: of each component (2n,).
+        slip_costs: of each component (2n,); second: part of it that the second component of a caster costs.
         cap: what a leap of the twist costs at most.
         before, since_search, lead_before: the set of the measurement before, how long ago it was searched for, and its lead.
     """
     count = len(parts) - 1
     n = count // 2
     least = slip_costs.min()
-    mask, cost, leapt = _climbed(parts, prior, known, slip_costs, cap, before)
+    mask, cost, leapt = _climbed(parts, prior, known, slip_costs, second, cap, before)
     if mask == 0 and cost < least:
         return mask, least, True, leapt  # any other set costs as much at least
-    if mask == before and not leapt and since_search < SEARCH_EVERY and cost < _penalty(mask, slip_costs) + least:
+    stays = mask == before and not leapt and since_search < SEARCH_EVERY
+    if stays and cost < _penalty(mask, slip_costs, second) + second * least:
         return mask, lead_before, False, leapt
     most = 2 + count * (count + 1) // 2 + 3 * (1 << min(n, MOST_CASTERS))
     masks, costs = np.empty(most, dtype=np.int64), np.empty(most)
@@ -379,8 +393,7 @@ def best_set(parts, prior, known, slip_costs, cap, before, since_search, lead_be
             for q in range(10):
                 trial[q] = parts[count, q] - parts[k, q] - (parts[m, q] if m > k else 0.0)
             masks[found] = (1 << k) | (1 << m)
-            penalty = slip_costs[k] + (slip_costs[m] if m > k else 0.0)
-            costs[found], _ = _cost(trial, prior, known, penalty, cap)
+            costs[found], _ = _cost(trial, prior, known, _penalty(masks[found], slip_costs, second), cap)
             found += 1
     if n <= MOST_CASTERS:
         for casters in range(1, 1 << n):
@@ -393,10 +406,10 @@ def best_set(parts, prior, known, slip_costs, cap, before, since_search, lead_be
                 if kind < 2 and _size(casters) <= 2:
                     continue  # among the pairs
                 masks[found] = candidate
-                costs[found], _ = _cost(sum_of(parts, candidate), prior, known, _penalty(candidate, slip_costs), cap)
+                costs[found], _ = _cost(sum_of(parts, candidate), prior, known, _penalty(candidate, slip_costs, second), cap)
                 found += 1
     first = np.argmin(costs[:found])
-    best, best_cost, best_leapt = _climbed(parts, prior, known, slip_costs, cap, masks[first])
+    best, best_cost, best_leapt = _climbed(parts, prior, known, slip_costs, second, cap, masks[first])
     if cost <= best_cost:
         best, best_cost, best_leapt = mask, cost, leapt
     second = np.inf

@@ -128,12 +128,15 @@ class Scenario:
     end: float
 
 
-def drawn_scenario(seed: int, axes_share: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> Scenario:
+def drawn_scenario(
+    seed: int, axes_share: tuple[float, float, float] = (1.0, 0.0, 0.0), to_and_fro: bool = False
+) -> Scenario:
     """Return a scenario: 3 to 6 casters, 1 to n - 2 of them slip for a second or two on a drawn drive.
 
     Args:
         seed: of everything.
         axes_share: how often a caster slips in its rolling axis, its steering axis and both.
+        to_and_fro: slips change their signs, those along and across a wheel at different times.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 7))
@@ -156,6 +159,8 @@ def drawn_scenario(seed: int, axes_share: tuple[float, float, float] = (1.0, 0.0
         for axis in np.flatnonzero(axes):
             size = np.exp(rng.uniform(np.log(0.05), np.log(0.5))) * rng.choice([-1.0, 1.0])
             wave = 1.0 + rng.uniform(0.0, 0.3) * np.sin(2.0 * np.pi * rng.uniform(0.5, 4.0) * time)
+            if to_and_fro:
+                wave = np.sin(2.0 * np.pi * (rng.uniform(0.5, 4.0) * time + rng.random()))
             slip[:, i, axis] = size * wave * ramp
     source = "drive" if rng.random() < 0.5 else "difference"
     return Scenario(drive(robot, twist, slip, rng, velocity_source=source), casters, start, end)

@@ -62,6 +62,15 @@ def figure_4_1(folder: Path) -> list[str]:
     ]  # fmt: skip
 
 
+# Kinds of drawn scenarios: how often in which axes, and whether to and fro, see `drawn_scenario`.
+SCENARIOS = (
+    ("rolling axis", (1.0, 0.0, 0.0), False),
+    ("rolling 60 %, steering 20 %, both 20 %", (0.6, 0.2, 0.2), False),
+    ("both axes", (0.0, 0.0, 1.0), False),
+    ("both axes, to and fro", (0.0, 0.0, 1.0), True),
+)
+
+
 def scenarios(count: int) -> list[str]:
     """Drawn scenarios, by both methods."""
     lines = [
@@ -74,8 +83,8 @@ def scenarios(count: int) -> list[str]:
         "that the other axis seems to slip as well: it flags too many.", "",
     ]  # fmt: skip
     rows = []
-    for label, share in (("rolling axis", (1.0, 0.0, 0.0)), ("rolling 60 %, steering 20 %, both 20 %", (0.6, 0.2, 0.2))):
-        drawn = [drawn_scenario(seed, share) for seed in range(count)]
+    for label, share, to_and_fro in SCENARIOS:
+        drawn = [drawn_scenario(seed, share, to_and_fro) for seed in range(count)]
         for method in METHODS:
             outcomes = [judge(scenario, run(method, scenario.driven)) for scenario in drawn]
             rows.append([label, method, *_shares(outcomes)])
