@@ -131,7 +131,8 @@ def load_slip_noise(path: str | Path, robot: RobotDescription) -> SlipNoise:
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise EstimationError(f"slip noise {str(path)!r} cannot be read: {error}") from None
+        allowed = "allowed: a file that `calibrate` wrote"
+        raise EstimationError(f"slip noise {str(path)!r} cannot be read: {error}; {allowed}") from None
     except yaml.YAMLError as error:
         raise EstimationError(f"slip noise {str(path)!r} is no YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:

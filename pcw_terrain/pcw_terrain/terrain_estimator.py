@@ -154,8 +154,9 @@ FRICTION, SLIP_NOISE, SINCE_CHANGE, SUSPECT = range(10, RESULTS)
 VALID, TOO_FEW, TOO_LITTLE_SLIP, TOO_WIDE, WRONG_SIGN, NO_FIT, AT_A_BOUND, TOO_FAR = range(8)
 REASONS = (
     "valid", "too few readings at speed", "not enough slip to know", "not certain enough yet",
-    "forces act against the slip: a torque or a speed has the wrong sign", "the friction curve does not fit",
-    "at a bound of what is possible", "nothing felt of the ground for too long a way",
+    "forces act against the slip: a torque or a speed has the wrong sign, or the speed is that of an observer which believes "
+    "in far better ground",
+    "the friction curve does not fit", "at a bound of what is possible", "nothing felt of the ground for too long a way",
 )  # fmt: skip
 
 
