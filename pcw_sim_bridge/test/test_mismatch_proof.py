@@ -900,7 +900,7 @@ def test_held_out_data_that_hardly_hold_an_effect_do_not_refuse_it(
     held_out = SimpleNamespace(
         proposed=(0,), instances=(instance,), help_of=lambda index: help_and_work, is_smaller_with=lambda index: smaller
     )
-    found = Prover._useless(SimpleNamespace(), SimpleNamespace(named=(named,)), held_out)  # type: ignore[arg-type]
+    found = Prover._useless(SimpleNamespace(), SimpleNamespace(named=(named,), doubtful=frozenset()), held_out)  # type: ignore[arg-type]
     assert (found is not None) is refused
 
 

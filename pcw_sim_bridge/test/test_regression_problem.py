@@ -18,6 +18,7 @@ from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.nearest_effect import with_the_nearest
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
 from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, shared_beliefs
+from pcw_sim_bridge.mismatch.proof import Prover
 from pcw_sim_bridge.mismatch.regression_problem import (
     UNKNOWN,
     Channel,
@@ -635,6 +636,31 @@ def test_what_comes_nearest_to_a_name_is_told(size, drift, named):
     assert [entry.term.effect for entry in doubted.named] == named
     assert all(0.1 < entry.probability <= 0.5 for entry in doubted.named)
     assert bool(named) == any("ripple/axis does less than what the model" in said for said in doubted.remarks)
+
+
+def test_what_comes_nearest_is_not_named_where_another_would_do():
+    """Of a healthy robot's drives a give of the gears was named, which might as well have been softer tyres."""
+    time = np.arange(3000) / RATE
+    noise = 0.01 * np.random.default_rng(4).standard_normal(len(time))
+    column = np.sin(7.0 * time)
+    twins = {"ripple": (column, 100.0), "twin": (column + 1e-4 * np.cos(7.0 * time), 100.0)}
+    problem = linear_problem(0.05 * column + noise, twins)
+    problem = dataclasses.replace(problem, drifts=np.stack([np.sin(time), column], axis=1)[:, None, :])
+    explanation = explain(problem, np.random.default_rng(0), SelectionSettings(surrogates=20))
+    assert explanation.nearest() is not None and explanation.p_values[0] < FLAG_PROBABILITY
+    assert with_the_nearest(explanation).named == ()
+
+
+@pytest.mark.parametrize(("nats", "doubtful", "stays"), [(8.0, True, True), (1.0, True, False), (1.0, False, True)])
+def test_what_is_named_in_doubt_has_to_be_borne_out_held_out(nats: float, doubtful: bool, stays: bool):
+    """In what was held out it was not at work, which speaks against no other effect."""
+    own = Instance(0, (), (0,))
+    named = SimpleNamespace(instance=own, ambiguous_with=(), probability=0.5)
+    explanation = SimpleNamespace(named=(named,), doubtful=frozenset([own] if doubtful else []))
+    held_out = SimpleNamespace(
+        instances=(own,), proposed=(0,), help_of=lambda index: (nats, nats), is_smaller_with=lambda index: False
+    )
+    assert (Prover._useless(None, explanation, held_out) is None) == stays
 
 
 @pytest.mark.parametrize(("alike", "ambiguous"), [(1.0, True), (0.0, False)])

@@ -154,6 +154,7 @@ class Explanation:
         remarks: what an adopted refinement changed, and why names are less sure, in plain sentences.
         floor: rms of each channel that nothing measured explains (C,).
         p_values: of each channel holding noise and tolerances only (C,).
+        doubtful: names that have to be borne out by held-out data, see `nearest_effect`.
     """
 
     search: EffectSearch
@@ -165,6 +166,7 @@ class Explanation:
     remarks: tuple[str, ...]
     floor: FloatArray
     p_values: FloatArray
+    doubtful: frozenset[Instance] = frozenset()
 
     @property
     def fit(self) -> Fit:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from .evidence_selection import BELOW_DETAILS
-from .explanation import HALF_AS_SURE, MOST_ALIKE, Explanation, explanation_by
+from .explanation import HALF_AS_SURE, Explanation, explanation_by
 from .findings import FLAG_PROBABILITY, some_of
 
 
@@ -13,7 +13,8 @@ def with_the_nearest(explanation: Explanation) -> Explanation:
     """Return the explanation with what came nearest to an effect, half as sure, where nothing else tells what is amiss.
 
     What does less than the model may misjudge is, by itself, as likely that. Where noise and tolerances do not explain what
-    channels hold, it is as likely the effect: that the model of a healthy robot leaves that, too, is rare.
+    channels hold, it is as likely the effect: that the model of a healthy robot leaves that, too, is rare. Errors of the model
+    look like several effects as a rule, and held-out data have to bear it out.
     """
     search, nearest = explanation.search, explanation.nearest()
     names = (channel.name for channel in search.problem.channels)
@@ -27,7 +28,7 @@ def with_the_nearest(explanation: Explanation) -> Explanation:
     instead = explanation_by(explanation, search.made_exact((nearest.refused,)))
     selection = instead.selection
     stands = bool(instead.named) and selection.losses[0] >= selection.threshold and selection.held_out[0] > 0.0
-    if not stands or len(set(instead.named[0].ambiguous_with)) > MOST_ALIKE:
+    if not stands or any(entry.ambiguous_with for entry in instead.named):
         search.place = here
         return explanation
     remark = (
@@ -35,4 +36,5 @@ def with_the_nearest(explanation: Explanation) -> Explanation:
         f"noise and tolerances alone do not explain {some_of(beyond)}, and nothing else explains more of that: half as sure."
     )
     named = tuple(dataclasses.replace(entry, probability=HALF_AS_SURE * entry.probability) for entry in instead.named)
-    return dataclasses.replace(instead, named=named, remarks=(*explanation.remarks, remark))
+    doubtful = frozenset(entry.instance for entry in named)
+    return dataclasses.replace(instead, named=named, remarks=(*explanation.remarks, remark), doubtful=doubtful)

@@ -353,6 +353,8 @@ class Prover:
             if believed.get(held_out.instances[index], 1.0) < LEAST_PROBABILITY:
                 return index, "an effect that is not proposed explains by far more"
             nats, work = held_out.help_of(index)
+            if held_out.instances[index] in explanation.doubtful and nats <= AMBIGUOUS:
+                return index, "it is too small to be proposed unless held-out data bear it out"
             least = -AMBIGUOUS if held_out.instances[index] in doubted else 0.0
             if work > AT_WORK and nats <= least and held_out.is_smaller_with(index):
                 # Noise spreads what data that hold it say for it, its work on average, by the root of twice that.
