@@ -1,5 +1,7 @@
 """Steerings that dry friction holds while they stand: what they then hold is no other effect, and their friction is whole."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,19 @@ def test_a_steering_sticks_where_it_holds_more_than_a_smoothed_friction_does(cas
     assert len(told) == bool(names) and all(name in said for name in names for said in told)
     judged = problem.valid.any(axis=1).mean()
     assert 0.2 < judged < 0.5 if names else judged > 0.9
+
+
+def test_a_friction_that_is_described_sticks_all_the_same_and_so_it_does_in_other_recordings():
+    numbers = {"coulomb": 0.25, "smoothing_speed": CREEPS}
+    described = dataclasses.replace(ROBOT, physics=(EffectInstance("steer_coulomb_friction", ("front_right",), numbers),))
+    recording = rubbing(("front_right",), STICKS, "identification", 20.0)
+    builder = RobotProblemBuilder(described, [recording])
+    builder.build()
+    assert builder.held.tolist() == [False, True, False, False]
+    # A straight line tells nothing of its friction; that it sticks is known from elsewhere.
+    straight = rubbing(("front_right",), STICKS, "chirp_x", 10.0)
+    alone, told = (RobotProblemBuilder(ROBOT, [straight], held=held).build() for held in (None, builder.held))
+    assert told.valid.any(axis=1).sum() < 0.5 * alone.valid.any(axis=1).sum()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pcw_description.robot_description import STEER
+from pcw_description.effects.registry import get
+from pcw_description.robot_description import AXIS_NAMES, STEER, RobotDescription
 
 from .channel_differences import ChannelDifferences
 from .lost_torques import DRY_SPEED, FORCES, by_joint
@@ -24,14 +25,20 @@ LEAST_TURNING = 30  # samples that tell how large a friction is
 RUBS = 6.0  # standard errors from which on a steering rubs
 # Times what is left in rms where steerings turn, from which on it is left by one that stands.
 LEFT_BEHIND = 2.0
+AT_MOST = 1.5  # times what the friction does where steerings turn, up to which it may do where they stand
 
 
 def held_steerings(
-    differences: ChannelDifferences, valid: BoolArray, standing: BoolArray, instruments: Sequence[Nuisance]
+    robot: RobotDescription,
+    differences: ChannelDifferences,
+    valid: BoolArray,
+    standing: BoolArray,
+    instruments: Sequence[Nuisance],
 ) -> BoolArray:
     """Return which steerings (n,) rub and hold, while they stand, what no smoothed friction does.
 
     Args:
+        robot: the nominal robot, some of whose steerings may be described to rub.
         differences: the channels of the motions under the description.
         valid: samples (T, C) that can be judged.
         standing: those in which each steering stands (T, n).
@@ -52,13 +59,31 @@ def held_steerings(
     columns = np.concatenate([friction, *(number.column[:, FORCES, None] for number in instruments)], axis=2)
     residual = differences.residual[:, FORCES]
     deviation = channel_deviations(residual, np.repeat(turning[:, None], residual.shape[1], axis=1))
-    left, sizes, errors = _fitted(columns / deviation[:, None], residual / deviation, turning)
-    rubs = looked_at & (sizes[: len(nothing)] > RUBS * errors[: len(nothing)])
+    columns /= deviation[:, None]
+    residual = residual / deviation
+    left, sizes, errors = _fitted(columns, residual, turning)
+    described = _described(robot)
+    rubs = looked_at & ((described > 0.0) | (sizes[: len(nothing)] > RUBS * errors[: len(nothing)]))
     held = usable & standing[:, rubs].any(axis=1)
     if not held.any() or (usable & ~held).sum() < LEFT_PART * usable.sum():
         return nothing
     usual, there = (float(np.mean(left[rows] ** 2)) for rows in (turning, held))
-    return rubs if there > LEFT_BEHIND**2 * usual else nothing
+    # A friction holds no more than its size: what is left of more than that is something else. Nor does what frictions do to
+    # the robot cancel out, as that of steerings does which swing together.
+    found, whole = (np.where(rubs, more + sizes[: len(nothing)], 0.0) for more in (0.0, described))
+    seen, most = (float(np.mean((columns[turning, :, : len(nothing)] @ of) ** 2)) for of in (found, whole))
+    cancels = seen > AT_MOST**2 * float(np.mean(residual[turning] ** 2))
+    return rubs if LEFT_BEHIND**2 * usual < there < AT_MOST**2 * most and not cancels else nothing
+
+
+def _described(robot: RobotDescription) -> FloatArray:
+    """Dry friction of the steerings in the description (n,) [N m]."""
+    found = np.zeros(robot.n)
+    for instance in robot.physics:
+        axis = instance.axis or getattr(get(instance.name), "axis", None)
+        if "coulomb" in instance.parameters and axis == AXIS_NAMES[STEER]:
+            found[np.isin(robot.caster_names, instance.target)] += instance.parameters["coulomb"]
+    return found
 
 
 def _fitted(columns: FloatArray, residual: FloatArray, rows: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:

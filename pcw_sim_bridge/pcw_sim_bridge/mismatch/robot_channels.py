@@ -99,7 +99,7 @@ class RobotProblemBuilder:
 
     def __init__(
         self, robot: RobotDescription, recordings: Sequence[Recording], cutoff: float | None = None, live: bool = False,
-        lifted: bool = False, leads: FloatArray | None = None,
+        lifted: bool = False, leads: FloatArray | None = None, held: BoolArray | None = None,
     ) -> None:
         """Filter the recordings.
 
@@ -111,6 +111,8 @@ class RobotProblemBuilder:
             lifted: the wheels were off the ground; see `joint_balance`.
             leads: by how much other recordings of this robot say that the stamps of IMU and tracker are ahead (2,) [s]; None
                 has these say so.
+
+            held: which steerings (n,) are known from other recordings of this robot to stick; None has these say so.
 
         Raises:
             MismatchError: no piece is long enough; or off the ground, where torques are all there is, none were recorded.
@@ -138,7 +140,7 @@ class RobotProblemBuilder:
         self._leads, self._said = np.zeros(2), leads
         self._seeming: ModelNumbers | None = None
         # Steerings that dry friction holds while they stand.
-        self._held = np.zeros(robot.n, dtype=bool)
+        self.held, self._known_held = np.zeros(robot.n, dtype=bool), held
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -243,10 +245,12 @@ class RobotProblemBuilder:
                 differences = ChannelDifferences(self.model, self.motions, self.filters)
             valid = self._valid(differences)
             standing = [self._standing(motion)[:, STEER::2].astype(float) for motion in self.motions]
-            held = held_steerings(differences, valid, differences.filtered(standing) > 0.5, instruments)
+            held = self._known_held
+            if held is None:
+                held = held_steerings(self.robot, differences, valid, differences.filtered(standing) > 0.5, instruments)
             self._read = with_balanced_torques(self._read, differences, valid, instruments)
             self.motions = self._motions_of(self.model, leads=self._leads)
-            self._held = held
+            self.held = held
         return self._as_read()
 
     def _as_moved(self) -> list[RobotMotion]:
@@ -450,7 +454,7 @@ class RobotProblemBuilder:
 
     def _stuck(self, motion: RobotMotion) -> BoolArray:
         """Samples (T,) in which a steering that sticks stands, or turns so slowly that a smoothed friction is not whole."""
-        return np.asarray(self._standing(motion, WHOLE_SPEED)[:, STEER::2][:, self._held].any(axis=1), dtype=bool)
+        return np.asarray(self._standing(motion, WHOLE_SPEED)[:, STEER::2][:, self.held].any(axis=1), dtype=bool)
 
     def _standing(self, motion: RobotMotion, speed: float = HELD_SPEED) -> BoolArray:
         """Samples (T, 2n) in which a joint may be held by dry friction of unknown size: all but short moments of reversal."""
@@ -461,7 +465,7 @@ class RobotProblemBuilder:
 
     def _sticking(self) -> tuple[str, ...]:
         """Which steerings stick, and how many samples are not judged for that."""
-        names = [name for name, held in zip(self.robot.caster_names, self._held, strict=True) if held]
+        names = [name for name, held in zip(self.robot.caster_names, self.held, strict=True) if held]
         if not names:
             return ()
         part = np.mean(np.concatenate([self._stuck(motion) for motion in self.motions]))

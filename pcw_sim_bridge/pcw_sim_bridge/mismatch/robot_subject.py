@@ -69,6 +69,7 @@ class RobotSubject:
         self.name = f"robot {robot.name}"
         self._cutoff: float | None = None
         self._leads: FloatArray | None = None
+        self._held: BoolArray | None = None
         self._choosing = threading.Lock()
         self._undescribed = Undescribed()
         self._missing: tuple[str, ...] = ()
@@ -165,11 +166,12 @@ class RobotSubject:
 
     def problem(self, opened: Sequence[Opened]) -> RegressionProblem:
         """Return the regression problem of the recordings that are fitted."""
-        self._leads = None
+        self._leads, self._held = None, None
         builder = self._builder(opened)
         problem = builder.build()
-        # In what is held out the same clocks are ahead by as much, though the robot may move too little to show it.
-        self._leads = builder.leads
+        # In what is held out the same clocks are ahead by as much, and the same steerings stick, though the robot may move too
+        # little to show it.
+        self._leads, self._held = builder.leads, builder.held if builder.held.any() else None
         return problem
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
@@ -243,7 +245,9 @@ class RobotSubject:
     def _builder(self, opened: Sequence[Opened]) -> RobotProblemBuilder:
         recordings, robot = [o.recording for o in opened], self._seen_robot()
         try:
-            return RobotProblemBuilder(robot, recordings, self._band(opened), lifted=self._off_ground, leads=self._leads)
+            return RobotProblemBuilder(
+                robot, recordings, self._band(opened), lifted=self._off_ground, leads=self._leads, held=self._held
+            )
         except MismatchError as error:
             told = dict.fromkeys(warning for o in opened for warning in o.finding.warnings)
             raise MismatchError("; ".join((str(error), *told))) from None
@@ -276,7 +280,8 @@ class RobotSubject:
         robot = dataclasses.replace(self.robot, physics=(*self.robot.physics, *effects))
         subject = RobotSubject(retuned_robot(robot, retuned))
         as_it_really_is(subject.robot)
-        subject._cutoff, subject._lifted, subject._leads = self._cutoff, self._lifted, self._leads
+        subject._cutoff, subject._lifted = self._cutoff, self._lifted
+        subject._leads, subject._held = self._leads, self._held
         subject._undescribed = Undescribed.of(retuned, self.robot.caster_names)
         return subject
 
