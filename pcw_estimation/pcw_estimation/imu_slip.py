@@ -568,8 +568,9 @@ def correct_kernel(geometry, position, velocity, dt, ahead, numbers, before):  #
         for k in range(2 * n):
             if int(state[_CHOSEN]) >> k & 1:
                 slip_costs[k] *= RETURN_SHARE * RETURN_SHARE
+    second = 1.0  # as dear as the first: here an IMU tells the motion, too
     chosen, lead, searched, leapt = best_set(
-        parts, prior, started, slip_costs, 1.0, cap, int(state[_CHOSEN]), state[_SINCE_SEARCH], state[_LEAD]
+        parts, prior, started, slip_costs, second, cap, int(state[_CHOSEN]), state[_SINCE_SEARCH], state[_LEAD]
     )
     total = sum_of(parts, chosen)
     # The gyro helps where too few wheels roll to tell the turning rate.

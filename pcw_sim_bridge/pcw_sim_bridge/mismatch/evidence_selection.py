@@ -366,9 +366,7 @@ class EffectSearch(SetGrowth):
         if candidates and math.isfinite(candidates[0].gain):
             chosen = self.made_exact((*others, refined_shape(regression, others, candidates[0].instance)))
             instead = self.prune(self.whiten_beside(chosen), chosen, selection.threshold)
-            there = self.place
             odds = self._odds_there(selection, here, instead.regression, instead.fit.instances)
-            self.place = there
             said = " and ".join(map(self.label, instead.fit.instances))
             self.progress(f"{said} instead, from the beginning: log odds {odds:.1f}")
             if not any(found.term == rival for found in instead.fit.instances):
@@ -394,7 +392,6 @@ class EffectSearch(SetGrowth):
             self.place = there
             evidence, left = self._reached_with(noise, instead)
             odds += 0.5 * noise.odds(evidence - own, own_left, left)
-        self.place = here
         return odds
 
     def odds_instead(self, selection: Selection, others: tuple[Instance, ...], rivals: Sequence[int]) -> float:
@@ -492,7 +489,7 @@ class EffectSearch(SetGrowth):
     def _alike(
         self, selection: Selection, others: tuple[Instance, ...], own: Instance, straight: bool = False
     ) -> list[Instance]:
-        """Effects that do an effect's work nearly as well, to the first order of one of the two; straight: or of none."""
+        """Effects that do an effect's work nearly as well, of which a first order may not say it; straight: also others."""
         regression, terms = selection.regression, self.problem.terms
         found = []
         for candidate in regression.scan(others)[0]:

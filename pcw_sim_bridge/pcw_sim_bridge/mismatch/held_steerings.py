@@ -45,14 +45,15 @@ def held_steerings(
         instruments: numbers of the description that are masses.
     """
     usable: BoolArray = valid[:, FORCES].min(axis=1)
-    nothing = np.zeros(standing.shape[1], dtype=bool)
+    n = standing.shape[1]
+    nothing = np.zeros(n, dtype=bool)
     turning = usable & ~standing.any(axis=1)
     looked_at = standing[usable].mean(axis=0) > LEAST_PART
     if turning.sum() < LEAST_TURNING or not looked_at.any():
         return nothing
     shapes = []
     for motion in differences.motions:
-        shape = np.zeros((len(motion.time), 2 * len(nothing), 1))
+        shape = np.zeros((len(motion.time), 2 * n, 1))
         shape[:, STEER::2, 0] = -np.tanh(motion.velocity[:, :, STEER] / DRY_SPEED)
         shapes.append(by_joint(shape))
     friction = differences.of_torque(shapes)[:, FORCES, STEER::2]
@@ -63,15 +64,15 @@ def held_steerings(
     residual = residual / deviation
     left, sizes, errors = _fitted(columns, residual, turning)
     described = _described(robot)
-    rubs = looked_at & ((described > 0.0) | (sizes[: len(nothing)] > RUBS * errors[: len(nothing)]))
+    rubs = looked_at & ((described > 0.0) | (sizes[:n] > RUBS * errors[:n]))
     held = usable & standing[:, rubs].any(axis=1)
     if not held.any() or (usable & ~held).sum() < LEFT_PART * usable.sum():
         return nothing
     usual, there = (float(np.mean(left[rows] ** 2)) for rows in (turning, held))
     # A friction holds no more than its size: what is left of more than that is something else. Nor does what frictions do to
     # the robot cancel out, as that of steerings does which swing together.
-    found, whole = (np.where(rubs, more + sizes[: len(nothing)], 0.0) for more in (0.0, described))
-    seen, most = (float(np.mean((columns[turning, :, : len(nothing)] @ of) ** 2)) for of in (found, whole))
+    found, whole = (np.where(rubs, more + sizes[:n], 0.0) for more in (0.0, described))
+    seen, most = (float(np.mean((columns[turning, :, :n] @ of) ** 2)) for of in (found, whole))
     cancels = seen > AT_MOST**2 * float(np.mean(residual[turning] ** 2))
     return rubs if LEFT_BEHIND**2 * usual < there < AT_MOST**2 * most and not cancels else nothing
 
