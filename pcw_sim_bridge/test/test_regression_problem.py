@@ -17,7 +17,7 @@ from pcw_sim_bridge.mismatch.findings import FLAG_PROBABILITY
 from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.nearest_effect import with_the_nearest
 from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
-from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, shared_beliefs
+from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, overshadowed_beliefs, shared_beliefs
 from pcw_sim_bridge.mismatch.proof import Prover
 from pcw_sim_bridge.mismatch.regression_problem import (
     UNKNOWN,
@@ -1179,3 +1179,40 @@ def test_a_name_that_a_law_of_the_same_argument_can_hold_is_believed_by_half(arg
     search = EffectSearch(problem, np.random.default_rng(0))
     selection = search.conclude((Instance(0, (), (0,)), Instance(1, (), tuple(range(len(powers))))), 5.0)
     assert shared_beliefs(search, selection) == ({0: SHARED_BELIEF} if shared else {})
+
+
+@pytest.mark.parametrize(("size", "elsewhere", "shadowed"), [(0.3, False, True), (3.0, False, False), (0.3, True, False)])
+def test_a_name_that_does_less_than_an_unknown_law_in_its_channel_is_believed_by_half(size, elsewhere, shadowed):
+    """A ripple of motors was there for sure beside a law of twice its size, whose form did not quite hold.
+
+    Not where it does more than the law, nor where it does its work in a channel of its own.
+    """
+    rng = np.random.default_rng(3)
+    time = np.arange(20 * SAMPLES) / RATE
+    ripple, law = np.sin(11.0 * time), np.sin(time)
+    left = np.stack([law, np.zeros_like(law)], axis=1) + NOISE * rng.standard_normal((len(time), 2))
+    left[:, int(elsewhere)] += size * ripple
+
+    def columns(signal, channel):
+        moved = np.zeros((len(time), 2, 1))
+        moved[:, channel, 0] = signal
+        return lambda shape: moved
+
+    problem = one_channel(
+        left[:, 0],
+        left[:, 0],
+        nuisances=(),
+        terms=(
+            Term("ripple", ("axis",), (LinearParameter("amplitude", "1", -9.0, 9.0, 1.0),), ({},),
+                 columns(ripple, int(elsewhere)), arguments=("angle",)),
+            Term(UNKNOWN, ("axis",), (LinearParameter("weight_0", "", -9.0, 9.0, 1.0),), ({},),
+                 columns(law, 0), arguments=("velocity",)),
+        ),
+    )  # fmt: skip
+    problem = dataclasses.replace(
+        problem, channels=(Channel("axis_force", "N"), Channel("other", "N")), measured=left, residual=left,
+        valid=np.ones(left.shape, dtype=bool),
+    )  # fmt: skip
+    search = EffectSearch(problem, np.random.default_rng(0))
+    selection = search.conclude((Instance(0, (), (0,)), Instance(1, (), (0,))), 5.0)
+    assert overshadowed_beliefs(search, selection) == ({0: SHARED_BELIEF} if shadowed else {})

@@ -148,7 +148,7 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
         search, selection, final = _adopted(search, selection, law)
         selection = _without_mere_relief(search, _with_names_beside(search, selection))
         after = {i.term for i in selection.fit.instances}
-        withdrawn += [(search.label(i), final.depends_on[0]) for i in before if i.term not in after]
+        withdrawn += [(search.label(i), " and ".join(final.depends_on)) for i in before if i.term not in after]
         found.append((final, law))
         result = OpenSetTest(search, selection.fit.instances).run(selection.threshold)
         if not result.leftovers:
@@ -172,6 +172,12 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
         for i in selection.fit.instances if i.term in shared
     )  # fmt: skip
     beliefs |= shared
+    shadowed = {term: belief for term, belief in overshadowed_beliefs(search, selection).items() if term not in shared}
+    doubts += tuple(
+        f"{search.label(i)} does less than the law outside the library in the same channels, and may mend what that does not "
+        "do quite right; half as sure for that." for i in selection.fit.instances if i.term in shadowed
+    )  # fmt: skip
+    beliefs |= shadowed
     return Judgement(
         search, selection, dataclasses.replace(result, leftovers=(*laws, *result.leftovers)), tuple(withdrawn), beliefs, doubts
     )
@@ -207,6 +213,29 @@ def shared_beliefs(search: EffectSearch, selection: Selection) -> dict[int, floa
             if _held(rows(name), functions):
                 beliefs[name.term] = SHARED_BELIEF
     return beliefs
+
+
+def overshadowed_beliefs(search: EffectSearch, selection: Selection) -> dict[int, float]:
+    """What is left of the probability of names, by term, that do most of their work where an unknown law does more.
+
+    How far the form of a law holds nobody knows. What it leaves there is no noise, and a small name may stand for that.
+    """
+    problem, fit = search.problem, selection.fit
+    laws = [i for i in fit.instances if is_unknown(problem, i)]
+    if not laws:
+        return {}
+    rows = _standard_rows(search, selection)
+    power, position = {}, len(problem.nuisances)
+    for instance in fit.instances:
+        weights = fit.mean[position : position + len(instance.active)]
+        position += len(instance.active)
+        power[instance] = np.sum((rows(instance) @ weights).reshape(problem.valid.shape) ** 2, axis=0)
+    most = np.max([power[law] for law in laws], axis=0)
+    return {
+        i.term: SHARED_BELIEF
+        for i in fit.instances
+        if i not in laws and float(np.sum(power[i][most > power[i]])) > 0.5 * float(np.sum(power[i]))
+    }
 
 
 def _standard_rows(search: EffectSearch, selection: Selection) -> Callable[[Instance], FloatArray]:
