@@ -52,7 +52,7 @@ def read_joint_series(
     stamp = (stamp_ns - (stamp_ns[0] if t0_ns is None else t0_ns)) * 1e-9
     table.warn_of_gaps(stamp)
     if measured:
-        _leave_out_idle_velocities(table, joints, values)
+        _leave_out_idle_fields(table, joints, values)
         _warn_of_missing_fields(table, joints, values)
         correct_units(stamp, names, robot, values[POSITION], values[VELOCITY], table.warn)
     else:
@@ -125,18 +125,25 @@ def _warn_of_missing_fields(table: MessageTable, joints: _JointTable, values: Fl
             table.warn("missing_field", f"no {name} of {which} was measured; it is NaN", count)
 
 
-def _leave_out_idle_velocities(table: MessageTable, joints: _JointTable, values: FloatArray) -> None:
-    """Some drivers send zeros for what they do not measure; in place, on values (3, T, m)."""
-    idle = [
-        column
-        for column in np.flatnonzero(joints.ever_present)
-        if not values[VELOCITY, :, column].any() and np.ptp(values[POSITION, :, column]) > MOVED
-    ]
-    if idle:
-        values[VELOCITY][:, idle] = np.nan
-        which = list_names(np.array(joints.names)[idle])
-        text = f"the velocity of {which} is 0 throughout although the position moves: not measured; it is left out (NaN)"
-        table.warn("missing_field", text, len(idle))
+def _leave_out_idle_fields(table: MessageTable, joints: _JointTable, values: FloatArray) -> None:
+    """Some drivers send zeros for what they do not measure; in place, on values (3, T, m).
+
+    A joint that moves has a velocity. It may have no torque; that none of several joints ever has any is no measurement.
+    """
+    there = np.flatnonzero(joints.ever_present)
+    moving = there[np.ptp(values[POSITION][:, there], axis=0) > MOVED]
+    still = moving[~values[VELOCITY][:, moving].any(axis=0)]
+    _leave_out(table, joints, values, VELOCITY, still)
+    if len(moving) > 1 and not values[EFFORT][:, there].any():
+        _leave_out(table, joints, values, EFFORT, there)
+
+
+def _leave_out(table: MessageTable, joints: _JointTable, values: FloatArray, kind: int, columns: IntArray) -> None:
+    if len(columns):
+        values[kind][:, columns] = np.nan
+        which = "every joint" if len(columns) == joints.ever_present.sum() else list_names(np.array(joints.names)[columns])
+        text = f"the {FIELDS[kind]} of {which} is 0 throughout although the position moves: not measured; it is left out (NaN)"
+        table.warn("missing_field", text, len(columns))
 
 
 # --- From messages to one stream ------------------------------------------------------------------------

@@ -850,6 +850,18 @@ def test_zeros_for_a_velocity_that_nobody_measures_are_left_out(robot: RobotDesc
     np.testing.assert_array_equal(recording.joint_states.velocity[:, :, DRIVE], spoilt.velocity[:, :, DRIVE])
 
 
+@pytest.mark.parametrize("measured", [False, True])
+def test_zeros_for_efforts_that_nobody_measures_are_left_out(measured: bool, robot: RobotDescription, tmp_path: Path) -> None:
+    """Hardware interfaces without torques send zeros; a joint alone may well have none, as one that is only dragged along."""
+    spoilt = drive(robot)
+    spoilt.effort[:, int(measured):] = 0.0
+    recording = Recording.open(spoilt.write(tmp_path / "bag"), robot)
+    assert np.isnan(recording.joint_states.effort).all() != measured
+    texts = [str(warning) for warning in recording.warnings if warning.code == "missing_field"]
+    assert len(texts) == (not measured)
+    assert all(text.startswith("joint_states: the effort of every joint is 0 throughout") for text in texts)
+
+
 def test_arrays_of_another_length_than_the_names_are_damaged(robot: RobotDescription, tmp_path: Path) -> None:
     path = tmp_path / "bag"
     healthy = drive(robot).keep(np.arange(300))

@@ -196,6 +196,29 @@ def test_a_missing_caster_is_named_and_the_others_are_used(
     assert any(entry["sensor"] == "caster front_right" for entry in report["absent"])
 
 
+@pytest.mark.parametrize(
+    ("joints", "value", "says"),
+    [
+        (slice(None), 0.0, "the effort of every joint is 0 throughout"),
+        (slice(2, 3), np.nan, "effort of some joints is not known: that of front_right_drive is NaN"),
+        (slice(2, 4), 0.0, "that of front_right_drive, front_right_steer is the same throughout although they move"),
+    ],
+    ids=["zeros", "one is NaN", "two are always zero"],
+)
+def test_torques_that_were_not_measured_are_named_and_the_motion_is_used(
+    joints: slice, value: float, says: str, drive: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Zeros were taken for torques, which ended in an error after minutes; one NaN left no sample at all."""
+    drive.effort[:, joints] = value
+    code, errors, report = analyse(capsys, drive.write(tmp_path / "run"), tmp_path / "report")
+    assert (code, errors) == (0, "")
+    assert [says in warning for warning in report["inputs"][0]["warnings"]].count(True) == 1
+    assert {channel["name"] for channel in report["channels"]} >= {"gyro", "accelerometer/x", "accelerometer/y"}
+    assert not any("force" in channel["name"] for channel in report["channels"])
+    assert not report["effects"]
+    assert any(entry["sensor"] == "effort in joint_states" for entry in report["absent"])
+
+
 def test_angles_in_counts_are_named_and_nothing_is_made_of_them(
     drive: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

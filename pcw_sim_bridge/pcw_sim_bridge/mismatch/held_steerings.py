@@ -48,8 +48,10 @@ def held_steerings(
     n = standing.shape[1]
     nothing = np.zeros(n, dtype=bool)
     turning = usable & ~standing.any(axis=1)
+    if turning.sum() < LEAST_TURNING:
+        return nothing
     looked_at = standing[usable].mean(axis=0) > LEAST_PART
-    if turning.sum() < LEAST_TURNING or not looked_at.any():
+    if not looked_at.any():
         return nothing
     shapes = []
     for motion in differences.motions:

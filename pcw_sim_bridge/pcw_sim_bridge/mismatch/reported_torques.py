@@ -20,7 +20,32 @@ LEAST_SAMPLES = 200
 # Stamps whose intervals differ from a period by more than this part of it as a rule, those of arrival on a busy network, do
 # not say which command a report answers.
 SCATTERED = 0.2
+MOVED = 0.1  # [rad]
+SAME = "is the same throughout although they move, as of a motor that is dead or not measured"
+NO_BALANCE = "with one torque unknown no forces balance, and those of the others are not used"
 LEFT_OUT = "what happens between commands and torques is not looked for there"
+
+
+def unmeasured_torques(robot: RobotDescription, recording: Recording) -> str:
+    """Say which joints' torques were not measured though those of others were; "" where all were, or none.
+
+    A drive may send the same number for ever. Of a joint that moves and is not commanded to give none, that is no measurement,
+    or it is one of a motor that is dead: nothing recorded tells.
+    """
+    effort, commands = recording.joint_states.effort, held_commands(robot, recording)
+    never, same = [], []
+    for i, axis in np.ndindex(robot.n, 2):
+        name, own = f"{robot.caster_names[i]}_{AXIS_NAMES[axis]}", effort[:, i, axis]
+        own, angle = own[np.isfinite(own)], recording.joint_states.position[:, i, axis]
+        if not len(own):
+            never.append(name)
+        elif np.ptp(own) == 0.0 and np.nanmax(angle) - np.nanmin(angle) > MOVED:
+            if commands is None or np.nan_to_num(commands[:, i, axis]).any():
+                same.append(name)
+    if not never and not same or len(never) == 2 * robot.n:
+        return ""
+    told = [f"that of {', '.join(names)} {how}" for names, how in ((never, "is NaN"), (same, SAME)) if names]
+    return f"joint_states: the effort of some joints is not known: {' and '.join(told)}; {NO_BALANCE}"
 
 
 def coarse_step(torque: FloatArray) -> float:

@@ -316,8 +316,8 @@ def _torque_band(torque: FloatArray | None, rate: float) -> float:
 
 
 def has_torques(recordings: Sequence[Recording]) -> bool:
-    """Whether torques were recorded, in all of them."""
-    return all(bool(np.isfinite(recording.joint_states.effort).any()) for recording in recordings)
+    """Whether torques were recorded, of all joints and in all of them: with one unknown no forces balance."""
+    return all(bool(np.isfinite(recording.joint_states.effort).any(axis=0).all()) for recording in recordings)
 
 
 def has_balance(robot: RobotDescription, recordings: Sequence[Recording]) -> bool:

@@ -39,10 +39,10 @@ from .joint_ripples import JointRipple, joint_ripples
 from .long_recordings import part_of
 from .off_ground import wheels_off_ground, wheels_turn_alone
 from .regression_problem import BoolArray, FloatArray, RegressionProblem
-from .reported_torques import doubtful_reports, told_of
+from .reported_torques import doubtful_reports, told_of, unmeasured_torques
 from .ripple_sizes import RippleScale, RippleSize
 from .robot_channels import RobotProblemBuilder
-from .robot_motion import base_pose, choose_cutoff
+from .robot_motion import base_pose, choose_cutoff, has_torques
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
 from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_squares
 from .rolling_model import WRENCH, model_awaits_compiling
@@ -89,6 +89,8 @@ class RobotSubject:
         self._check_casters(path, missing)
         if missing:
             recording = self._read(path, self._seen_robot(), topics)
+        unmeasured = unmeasured_torques(self._seen_robot(), recording)
+        if missing or unmeasured:
             # The force of one caster unknown, that of all together is.
             joints = recording.joint_states
             recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
@@ -97,6 +99,8 @@ class RobotSubject:
         late = late_stamps(recording, evened)
         recording, jumps = without_glitches(evened)
         warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *late, *jumps]
+        if unmeasured:
+            warnings.append(unmeasured)
         if self._is_lifted(path, recording):
             warnings.append(OFF_GROUND)
         else:
@@ -350,7 +354,7 @@ def _missing_casters(robot: RobotDescription, recording: Recording) -> tuple[str
 
 
 def _has_effort(recording: Recording) -> bool:
-    return bool(np.isfinite(recording.joint_states.effort).any())
+    return has_torques([recording])
 
 
 def _has_torque_commands(recording: Recording) -> bool:
