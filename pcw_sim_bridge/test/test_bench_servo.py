@@ -14,7 +14,7 @@ from pcw_sim_bridge.mismatch import open_set
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
 from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.explanation import Explanation, explain
+from pcw_sim_bridge.mismatch.explanation import Explanation, explain, strained_of_the_balance
 from pcw_sim_bridge.mismatch.findings import InputFinding
 from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
 from pcw_sim_bridge.mismatch.subject import Opened
@@ -159,6 +159,23 @@ def test_a_motor_that_gives_less_than_it_is_told() -> None:
     assert set(names) == {"torque_constant_error"} and found.leftovers == ()
     # Inertia and moment are known to 5 % each, and share what their description is off.
     assert names["torque_constant_error"]["error"] == pytest.approx(-0.3, abs=0.02)
+
+
+def test_an_error_of_the_torque_constant_may_be_a_load() -> None:
+    """Inertia and arm of an axis that are heavier by one factor are a motor that gives less by it; it was certain."""
+    _, found = explained("sines", gain=0.7)
+    [named] = found.named
+    assert named.ambiguous_with == ("payload_mass",) and named.probability <= 0.5
+
+
+def test_numbers_of_an_axis_that_no_healthy_one_has_are_of_the_balance() -> None:
+    """An arm that is too heavy was a certain error of the torque constant, which shares it out with the inertia."""
+    numbers = [
+        SimpleNamespace(name=name, narrowed=1.0, loose=False, deviation=1.0)
+        for name in ("inertia", "gravity_moment", "hanging_position", "clock_offset")
+    ]
+    strained = strained_of_the_balance(SimpleNamespace(nuisances=numbers), SimpleNamespace(mean=[-5.0, 5.0, 5.0, 5.0]))  # type: ignore[arg-type]
+    assert strained == ["inertia", "gravity_moment"]
 
 
 def test_an_inertia_that_is_half_of_the_described_one_is_no_error_of_the_torque_constant() -> None:

@@ -65,7 +65,9 @@ SAME = 0.9999
 # Effects and numbers that share out among each other what all torques do to the robot, and how much such an effect is believed
 # beside such numbers that no healthy robot has.
 OF_THE_BALANCE = ("payload_mass", "payload_offset", "torque_constant_error")
-NUMBERS_OF_THE_BALANCE = ("chassis.", "module.", "wheel.inertia", "rotors.", "torque_constant/")
+NUMBERS_OF_THE_BALANCE = (
+    "chassis.", "module.", "wheel.inertia", "rotors.", "torque_constant/", "inertia", "gravity_moment",
+)  # fmt: skip
 # Of wheels that cannot contradict each other these look like a slip in proportion to the motion.
 OF_ROLLING, CONSISTENCY = ("wheel_radius_error", "caster_offset_error"), "rolling_consistency/"
 HALF_AS_SURE = 0.5
@@ -755,9 +757,9 @@ def _as_wide(
 def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
     """Say what else would do where one effect is on all casters with the same numbers at the drives and at the steerings.
 
-    Torques that are all wrong by one factor are also masses that are all wrong by it.
+    Torques that are all wrong by one factor are also masses that are all wrong by it. An axis has only one.
     """
-    doubted = list(named)
+    doubted = [_doubted_by_load(entry) if entry.term.target == ("axis",) else entry for entry in named]
     for first, second in itertools.combinations(range(len(named)), 2):
         one, other = named[first], named[second]
         same = one.term.effect == other.term.effect and one.term.target == other.term.target and len(one.term.target) > 1
@@ -775,6 +777,14 @@ def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
             probability = min(entry.probability, 1.0 / (1.0 + len(alike)))
             doubted[index] = dataclasses.replace(entry, ambiguous_with=ambiguous, probability=probability)
     return tuple(doubted)
+
+
+def _doubted_by_load(entry: NamedTerm) -> NamedTerm:
+    """Say of an error of an axis's torque constant that a load on it, which moves along, does the same."""
+    if entry.term.effect != "torque_constant_error":
+        return entry
+    ambiguous = tuple(dict.fromkeys((*entry.ambiguous_with, "payload_mass")))
+    return dataclasses.replace(entry, ambiguous_with=ambiguous, probability=min(entry.probability, 0.5))
 
 
 def _doubted_beside_friction(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:
