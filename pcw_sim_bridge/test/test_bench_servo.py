@@ -178,6 +178,16 @@ def test_numbers_of_an_axis_that_no_healthy_one_has_are_of_the_balance() -> None
     assert strained == ["inertia", "gravity_moment"]
 
 
+@pytest.mark.parametrize("kind", ["moves", "sines"])
+def test_half_a_sample_of_a_held_command_is_no_friction(kind: str) -> None:
+    """Its column was too small where an acceleration takes it: the delay came out too long, and the friction too small."""
+    names, found = explained(kind, coulomb=0.04, forwards=0.02)
+    assert set(names) == {COULOMB, VISCOUS}
+    assert names[VISCOUS]["viscous"] == pytest.approx(0.02, rel=0.004)
+    offset = [n.name for n in found.search.problem.nuisances].index("clock_offset")
+    assert found.fit.mean[offset] == pytest.approx(-0.5 / RATE, abs=0.0003)
+
+
 def test_an_inertia_that_is_half_of_the_described_one_is_no_error_of_the_torque_constant() -> None:
     """Which would relieve the inertia, and strain the arm's moment instead."""
     names, found = explained("sines", coulomb=0.04, forwards=0.02, inertia=2.0 * INERTIA)

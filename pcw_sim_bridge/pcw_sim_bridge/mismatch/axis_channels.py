@@ -200,11 +200,12 @@ class AxisProblemBuilder:
         self._acceleration = self._variables["acceleration"]
         self._valid = self._filtered([m.still for m in self.motions]) < 0.1
         self._scans: dict[str, FloatArray] = {}
-        self._plain_forces = self._explained_force((), in_channel=True)
+        self._plain_forces = self._explained_force((), in_channel=True, bare=True)
         self._smooth_forces = self._explained_force(())
         periodic = self._leading_periodic()
         self._smooth_forces = self._explained_force(periodic)
         self._smooth_forces = self._explained_force(periodic, with_load=True)
+        self._shifted_forces = self._explained_force(periodic, with_load=True, in_channel=True)
         self._periodic_columns = [self._columns(effect, shape)[:, 0, :] for effect, shape in periodic]
 
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
@@ -214,7 +215,11 @@ class AxisProblemBuilder:
         )
 
     def _explained_force(
-        self, periodic: Sequence[tuple[JointTorqueEffect, Shape]], with_load: bool = False, in_channel: bool = False
+        self,
+        periodic: Sequence[tuple[JointTorqueEffect, Shape]],
+        with_load: bool = False,
+        in_channel: bool = False,
+        bare: bool = False,
     ) -> list[FloatArray]:
         """The force as the simplest models of a drive would have it, at full rate.
 
@@ -222,9 +227,10 @@ class AxisProblemBuilder:
             periodic: effects periodic in position that take part, with their shapes.
             with_load: include a friction that follows the load as it is explained so far, which only effects non-linear in
                 the force need.
-            in_channel: fit it in the band of the channel, where it is in proportion to the force that acts, and give the part
-                of inertia and gravity alone. In the wider band the noise of an acceleration may be as large as itself, and
-                what is fitted there is smoother than the force: so it has to be where its magnitude is taken.
+            in_channel: fit it in the band of the channel, where it is in proportion to the force that acts. In the wider band
+                the noise of an acceleration may be as large as itself, and what is fitted there is smoother than the force: so
+                it has to be where its magnitude is taken.
+            bare: give the part of inertia and gravity alone.
 
         Effects that depend on the motor torque must not see the measured one: its noise is the residual's own noise,
         and a column that holds it would be "found" in any recording. Nor may it hold structure that the named effects
@@ -253,7 +259,10 @@ class AxisProblemBuilder:
         size = np.maximum(np.sqrt(np.mean(stacked**2, axis=0)), 1e-300)
         solution, *_ = np.linalg.lstsq(stacked / size, force, rcond=1e-8)
         scaled = solution / size
-        if in_channel:
+        if in_channel and not bare and not 1.0 / MISTAKEN < scaled[0] / axis.inertia < MISTAKEN:
+            # The force follows no inertia there: what comes out as one is a force that is late, or cogging.
+            return self._explained_force(periodic, with_load)
+        if bare:
             # Frictions and loads are free to be as large as the error makes them. What there seems to be of them where a force
             # is late by half a sample is none, and would tell how large the error is.
             scaled[1:4] = 0.0
@@ -346,10 +355,11 @@ class AxisProblemBuilder:
     def _skew(self) -> FloatArray:
         """What a force measured later than it acts adds per second of delay (T,): F(t - d) = F(t) - d F'(t).
 
-        Of the explained force, not the measured one, for the reason given there.
+        Of the explained force, not the measured one, for the reason given there; as large as it is in the channel. Of one
+        that is too small in its inertial part the delay comes out too long, and what that does to gravity passes for friction.
         """
         rates = [self.filters[m.recording].rate for m in self.motions]
-        return self._filtered([-derivative(f, rate) for f, rate in zip(self._smooth_forces, rates, strict=True)])
+        return self._filtered([-derivative(f, rate) for f, rate in zip(self._shifted_forces, rates, strict=True)])
 
     def build(self, smoothing: float) -> RegressionProblem:
         """Return the problem with the given smoothing of all signs."""
