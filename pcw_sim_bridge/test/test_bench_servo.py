@@ -10,6 +10,7 @@ import pytest
 
 from pcw_description.axis_recording import AxisDescription, AxisRecording, parse_axis_description
 from pcw_description.compiled import compiled
+from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch import open_set
 from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
 from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
@@ -186,6 +187,16 @@ def test_half_a_sample_of_a_held_command_is_no_friction(kind: str) -> None:
     assert names[VISCOUS]["viscous"] == pytest.approx(0.02, rel=0.004)
     offset = [n.name for n in found.search.problem.nuisances].index("clock_offset")
     assert found.fit.mean[offset] == pytest.approx(-0.5 / RATE, abs=0.0003)
+
+
+def test_how_fast_a_described_friction_reverses_is_nothing_that_is_missing() -> None:
+    """With a smoothing of another size than the drive's own, a Stribeck friction of nearly that speed mended it."""
+    axis, recording = recorded("sines", coulomb=0.12)
+    for smoothing in (1e-3, 0.3):
+        known = EffectInstance(COULOMB, ("axis",), {"coulomb": 0.12, "asymmetry": 0.0, "smoothing_speed": smoothing})
+        builder = AxisProblemBuilder(dataclasses.replace(axis, physics=(known,)), [recording])
+        found = explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
+        assert found.named == () and found.leftovers == ()
 
 
 def test_an_inertia_that_is_half_of_the_described_one_is_no_error_of_the_torque_constant() -> None:

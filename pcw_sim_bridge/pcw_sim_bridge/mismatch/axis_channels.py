@@ -296,8 +296,7 @@ class AxisProblemBuilder:
                 self._misfit([*fixed, *friction_columns(smoothing, width)]) for width in (0.03, 0.06, 0.12, 0.25, 0.5)
             )
 
-        # A reversal that takes more than a twentieth of the top speed is no dry friction.
-        grid = top * np.geomspace(5e-4, 0.05, 7)
+        grid = self._smoothings()
         best = grid[int(np.argmin([misfit(float(value)) for value in grid]))]
         for width in (0.5, 0.2):
             nearby = best * np.exp(width * np.array([-1.0, 0.0, 1.0]))
@@ -389,10 +388,7 @@ class AxisProblemBuilder:
         nuisances.append(
             Nuisance("clock_offset", "s", 0.0, _deviation(axis, "clock_offset", 1.0) * period, skew[:, None])
         )
-        for instance in axis.physics:
-            effect = all_effects()[instance.name]
-            if isinstance(effect, JointTorqueEffect):
-                predicted = predicted - self._filtered(self._contributions(effect, instance.parameters))
+        predicted = predicted - self._described()
         measured = self._force
         stamps = [self.filters[m.recording].decimate(m.time) for m in self.motions]
         start = {m.recording: m.time[0] for m in reversed(self.motions)}
@@ -421,6 +417,41 @@ class AxisProblemBuilder:
             sites=self._sites(start, smoothing),
             remarks=self._mistaken_units(),
         )
+
+    def _described(self) -> FloatArray:
+        """What the effects of the description do to the axis (T,).
+
+        How fast a friction reverses is no physics: by a value that is not this axis's it would leave a Stribeck friction of
+        about that speed. Where another one leaves less, that is taken.
+        """
+        described = [(all_effects()[instance.name], instance.parameters) for instance in self.axis.physics]
+        torques = [(effect, parameters) for effect, parameters in described if isinstance(effect, JointTorqueEffect)]
+
+        def does(changed: Mapping[str, float]) -> FloatArray:
+            total = np.zeros_like(self._force)
+            for effect, parameters in torques:
+                names = {p.name for p in effect.parameters}
+                own = {**parameters, **{name: value for name, value in changed.items() if name in names}}
+                total = total + self._filtered(self._contributions(effect, own))
+            return total
+
+        if not self._valid.any() or not any(p.name == SMOOTHING for effect, _ in torques for p in effect.parameters):
+            return does({})
+        velocity = self._variables["velocity"]
+        beside = [self._acceleration, velocity, np.ones_like(velocity), self._skew(), *self._gravity()]
+        known, _ = np.linalg.qr(np.stack(beside, axis=1)[self._valid])
+
+        def left(done: FloatArray) -> float:
+            force = (self._force + done)[self._valid]
+            return float(np.sum((force - known @ (known.T @ force)) ** 2))
+
+        return min([does({}), *(does({SMOOTHING: value}) for value in self._smoothings())], key=left)
+
+    def _smoothings(self) -> FloatArray:
+        """Speeds over which frictions may reverse: one that takes more than a twentieth of the top speed is not dry."""
+        top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.98)), 1e-12)
+        grid: FloatArray = top * np.geomspace(5e-4, 0.05, 7)
+        return grid
 
     def delay(self) -> float:
         """By how much the force is recorded later than it acts [s], roughly; 0 where that explains little.
