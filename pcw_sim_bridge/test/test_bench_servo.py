@@ -7,8 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import signal
 
-from pcw_description.axis_recording import AxisDescription, AxisRecording, parse_axis_description
+from pcw_description.axis_recording import AxisDescription, AxisRecording, Column, parse_axis_description
 from pcw_description.compiled import compiled
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch import open_set
@@ -17,6 +18,7 @@ from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.explanation import Explanation, explain, strained_of_the_balance
 from pcw_sim_bridge.mismatch.findings import InputFinding
+from pcw_sim_bridge.mismatch.late_speed import lateness
 from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
 from pcw_sim_bridge.mismatch.subject import Opened
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -197,6 +199,22 @@ def test_how_fast_a_described_friction_reverses_is_nothing_that_is_missing() -> 
         builder = AxisProblemBuilder(dataclasses.replace(axis, physics=(known,)), [recording])
         found = explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
         assert found.named == () and found.leftovers == ()
+
+
+def test_a_speed_that_is_later_than_the_position_is_not_used(tmp_path: Path) -> None:
+    """Behind the filter of a servo's firmware its acceleration is late, and a viscous friction was none any more."""
+    axis, recording = recorded("sines", coulomb=0.04, forwards=0.02)
+    axis = dataclasses.replace(axis, columns=axis.columns | {"velocity": Column("qd", "rad/s")})
+    speed = np.convolve(np.gradient(recording.position, 1.0 / RATE), np.ones(9) / 9.0, "same")
+    for lag, used in ((0.0, True), (0.03, False)):
+        pole = math.exp(-1.0 / (lag * RATE)) if lag else 0.0
+        read = signal.lfilter([1.0 - pole], [1.0, -pole], speed)
+        rows = np.stack([recording.time, recording.position, recording.force, read], axis=1)
+        np.savetxt(tmp_path / "servo.csv", rows, delimiter=",", header="t,q,tau,qd", comments="")
+        opened = AxisSubject(axis).open(tmp_path / "servo.csv", "fit", {})
+        assert (opened.recording.velocity is not None) == used
+        assert any("later than position" in warning for warning in opened.finding.warnings) != used
+    assert lateness(dataclasses.replace(recording, velocity=np.zeros(len(read)))) == 0.0  # that says nothing
 
 
 def test_an_inertia_that_is_half_of_the_described_one_is_no_error_of_the_torque_constant() -> None:

@@ -22,6 +22,7 @@ from pcw_description.effects.registry import get
 from .axis_channels import AxisProblemBuilder
 from .axis_rollout import axis_windows, rollout_floor, rollout_squares
 from .findings import InputFinding
+from .late_speed import with_timely_speed
 from .regression_problem import HEALTHY, FloatArray, RegressionProblem
 from .ripple_sizes import RippleSize
 from .rollout import Windows
@@ -47,7 +48,7 @@ class AxisSubject:
 
     def open(self, path: Path, role: str, topics: Mapping[str, str]) -> Opened:
         """Read one CSV, NPY, NPZ or MAT file; topics mean nothing here."""
-        recording = read_axis_recording(path, self.axis)
+        recording = with_timely_speed(read_axis_recording(path, self.axis))
         finding = InputFinding(str(path), file_digest(path), recording.duration, role, recording.warnings)
         return Opened(recording, finding)
 
