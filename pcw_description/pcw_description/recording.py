@@ -21,7 +21,7 @@ Codes of the warnings:
     non_finite         NaN or infinite values
     missing_caster     a caster of the robot without both joints
     missing_joint      a joint of the robot
-    missing_field      a joint's position, velocity or effort is never sent
+    missing_field      a joint's position, velocity or effort, or a quantity of the IMU, is never sent, or always 0
     incomplete_message messages without some of the joints that others have
     split_message      joints that come in separate messages
     wrong_unit         degrees, rpm, counts, g: from values that contradict each other
@@ -45,7 +45,7 @@ from .cdr_columns import CdrColumns, decode_columns
 from .errors import RecordingError, nearest_name
 from .recording_checks import DEGREE, order_stamps, position_scale, units_of
 from .recording_files import MessagesInMemory, RawMessage, RecordingFiles, RecordingWarning, WarningLog
-from .recording_joints import read_joint_series
+from .recording_joints import MOVED, read_joint_series
 from .recording_series import ImuSeries, JointSeries, JointTrace, OdometrySeries, TwistSeries, WrenchSeries
 from .recording_table import FloatArray, IntArray, MessageTable, RowArray
 from .robot_description import GRAVITY, RobotDescription
@@ -249,7 +249,18 @@ class Recording:
         stamp, stamp_ns = self._stamps(table, rows)
         table.warn_of_gaps(stamp)
         gyro, acceleration = self._imu_in_si(table, stamp, values[rows, :3], values[rows, 3:])
-        return ImuSeries(stamp, stamp_ns, gyro, acceleration)
+        for name, sensed, moved in (("gyro", gyro, self._turns()), ("acceleration", acceleration, True)):
+            if moved and not sensed.any():
+                table.warn("missing_field", f"the {name} is 0 throughout: not measured; it is NaN")
+                sensed[:] = np.nan
+        return ImuSeries(stamp, stamp_ns, gyro, acceleration) if np.isfinite([gyro, acceleration]).any() else None
+
+    def _turns(self) -> bool:
+        """Whether the robot turned, by what else was recorded of its motion, or joints, where that is nothing."""
+        motion = self.ground_truth or self.odom
+        angles = self.joint_states.position.reshape(len(self.joint_states), -1) if motion is None else motion.pose[:, 2:]
+        known = angles[:, np.isfinite(angles).any(axis=0)]
+        return bool((np.nanmax(known, axis=0) - np.nanmin(known, axis=0) > MOVED).any())
 
     @cached_property
     def ground_truth(self) -> OdometrySeries | None:

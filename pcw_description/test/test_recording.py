@@ -1105,6 +1105,19 @@ def test_gyro_in_degrees_and_acceleration_in_g_are_converted(robot: RobotDescrip
     np.testing.assert_allclose(recording.imu.acceleration, healthy.acceleration[::2])
 
 
+@pytest.mark.parametrize("name", ["gyro", "acceleration"])
+def test_zeros_for_what_an_imu_does_not_measure_are_left_out(name: str, robot: RobotDescription, tmp_path: Path) -> None:
+    """Many drivers leave at zero what their chip does not have; of a sensor of which nothing is left nothing was recorded."""
+    spoilt = drive(robot)
+    getattr(spoilt, name)[:] = 0.0
+    recording = Recording.open(spoilt.write(tmp_path / "one"), robot)
+    assert text_of(recording, "missing_field") == f"imu/data: the {name} is 0 throughout: not measured; it is NaN"
+    assert recording.imu is not None
+    assert np.isnan(getattr(recording.imu, name)).all()
+    spoilt.gyro[:] = spoilt.acceleration[:] = 0.0
+    assert Recording.open(spoilt.write(tmp_path / "both"), robot).imu is None
+
+
 def test_a_gyro_that_cannot_be_so_fast_is_named(robot: RobotDescription, tmp_path: Path) -> None:
     """Without any pose to compare with."""
     path = tmp_path / "bag"
