@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,13 @@ from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.robot_effects import with_pose
-from pcw_sim_bridge.mismatch.robot_motion import SMALLEST_CUTOFF, choose_cutoff, read_motions
+from pcw_sim_bridge.mismatch.robot_motion import (
+    SMALLEST_CUTOFF,
+    choose_cutoff,
+    read_motions,
+    seldom_read,
+    seldom_tracked,
+)
 from pcw_sim_bridge.mismatch.rolling_model import ModelNumbers
 from pcw_sim_bridge.mismatch.signal_filter import interpolated, uniform_segments
 from pcw_sim_bridge.simulated_run import record_run
@@ -172,3 +179,30 @@ def test_a_slow_sensor_sees_bends_and_a_pause_of_it_stays_open() -> None:
     well_inside = ~((grid < 0.2) | (grid > 5.7) | ((grid > 2.2) & (grid < 3.5)))
     assert np.abs(found - swing(grid))[well_inside].max() < 2e-3
     assert np.nanmax(np.abs(found - swing(grid))) < 0.02
+
+
+@pytest.mark.parametrize(("period", "says"), [(0.5, ""), (1.0, "a pose every 1.0 s says too little of the motion between")])
+def test_a_tracker_that_seldom_looks_says_nothing_of_what_lies_between(period: float, says: str, lively: Recording) -> None:
+    """A curve through a pose a second was held against wheels that turn twice in it: a law of a steering was made of that."""
+    rare, truth = copy.copy(lively), lively.ground_truth
+    assert truth is not None
+    kept = slice(None, None, round(period / float(np.median(np.diff(truth.stamp)))))
+    rare.ground_truth = dataclasses.replace(
+        truth, stamp=truth.stamp[kept], stamp_ns=truth.stamp_ns[kept], pose=truth.pose[kept], twist=truth.twist[kept]
+    )
+    assert says in seldom_tracked(rare)
+    assert bool(seldom_tracked(rare)) == bool(says)
+    [motion] = read_motions(THESIS, rare, 0, 5.0, True)
+    assert np.isfinite(motion.tracked_twist).any() != bool(says)
+
+
+@pytest.mark.parametrize(
+    ("rate", "torques", "told"), [(500.0, True, False), (20.0, True, False), (10.0, True, True), (10.0, False, False)]
+)
+def test_torques_that_are_seldom_read_are_told(rate: float, torques: bool, told: bool) -> None:
+    """A tenth of a second apart they balanced nothing: a friction was withdrawn for a law of all joints."""
+    stamp = np.arange(0.0, 10.0, 1.0 / rate)
+    effort = np.full((len(stamp), THESIS.n, 2), 1.0 if torques else np.nan)
+    recording: Any = SimpleNamespace(joint_states=SimpleNamespace(stamp=stamp, effort=effort))
+    assert seldom_read(recording).startswith(f"joint_states: at {rate:.2g} Hz torques change unseen" if told else "")
+    assert bool(seldom_read(recording)) == told

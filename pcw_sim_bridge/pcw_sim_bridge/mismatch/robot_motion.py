@@ -34,6 +34,9 @@ TORQUE_OVER_NOISE, TORQUE_NOISE_BAND = 3.0, (12.0, 40.0)
 PIECE, LEAST_PIECES = 2.0, 4  # [s]; of a spectrum
 LARGEST_GAP = 0.05  # [s]; of joints and IMU
 LARGEST_TRACKER_GAP = 0.1  # [s]
+# What a robot does between two poses so far apart [s] no curve through them tells.
+SLOWEST_TRACKER = 0.6
+SLOWEST_TORQUES = 15.0  # [Hz]; a force that changes faster than torques are read is balanced by none of them
 SHORTEST_SEGMENT = 1.0  # [s]
 
 
@@ -227,11 +230,32 @@ def _measured_motion(recording: Recording, stamps: FloatArray) -> FloatArray:
 def _tracked_pose(recording: Recording, stamps: FloatArray) -> FloatArray:
     """Tracked pose (T, 3) at stamps, its yaw without jumps; NaN where it was not recorded."""
     truth = recording.ground_truth
-    if truth is None or len(truth.stamp) < 2:
+    if truth is None or len(truth.stamp) < 2 or seldom_tracked(recording):
         return np.full((len(stamps), 3), np.nan)
     tracked = truth.pose.copy()
     tracked[:, 2] = np.unwrap(tracked[:, 2])
     return interpolated(stamps, truth.stamp, tracked, LARGEST_TRACKER_GAP)
+
+
+def seldom_tracked(recording: Recording) -> str:
+    """Say that poses were recorded too seldom to be held against the wheels; "" where they were not."""
+    truth = recording.ground_truth
+    period = float(np.median(np.diff(truth.stamp))) if truth is not None and len(truth.stamp) > 1 else 0.0
+    if period < SLOWEST_TRACKER:
+        return ""
+    return f"ground_truth/odom: a pose every {period:.1f} s says too little of the motion between; its channels are left out"
+
+
+def seldom_read(recording: Recording) -> str:
+    """Say that torques were recorded too seldom to balance what joints and chassis do between; "" where they were not."""
+    stamp = recording.joint_states.stamp
+    rate = 1.0 / max(float(np.median(np.diff(stamp))), 1e-9) if len(stamp) > 1 else math.inf
+    if rate > SLOWEST_TORQUES or not has_torques([recording]):
+        return ""
+    return (
+        f"joint_states: at {rate:.2g} Hz torques change unseen between readings, and what is found of forces may be that; "
+        "record them at 20 Hz or more"
+    )
 
 
 def tracked_place(robot: RobotDescription) -> FloatArray:

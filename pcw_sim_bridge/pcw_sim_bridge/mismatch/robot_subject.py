@@ -42,7 +42,7 @@ from .regression_problem import BoolArray, FloatArray, RegressionProblem
 from .reported_torques import doubtful_reports, told_of, unmeasured_torques
 from .ripple_sizes import RippleScale, RippleSize
 from .robot_channels import RobotProblemBuilder
-from .robot_motion import base_pose, choose_cutoff, has_torques
+from .robot_motion import base_pose, choose_cutoff, has_torques, seldom_read, seldom_tracked
 from .robot_nuisances import FLOOR, common_relaxation, rotor_armature
 from .robot_rollout import Undescribed, robot_windows, rollout_floor, rollout_squares
 from .rolling_model import WRENCH, model_awaits_compiling
@@ -99,8 +99,7 @@ class RobotSubject:
         late = late_stamps(recording, evened)
         recording, jumps = without_glitches(evened)
         warnings = [*(f"{warning.topic}: {warning.text}" for warning in found), *late, *jumps]
-        if unmeasured:
-            warnings.append(unmeasured)
+        warnings += [text for text in (unmeasured, seldom_read(recording), seldom_tracked(recording)) if text]
         if self._is_lifted(path, recording):
             warnings.append(OFF_GROUND)
         else:
@@ -368,7 +367,7 @@ def _has_imu(recording: Recording) -> bool:
 
 
 def _has_truth(recording: Recording) -> bool:
-    return recording.ground_truth is not None
+    return recording.ground_truth is not None and not seldom_tracked(recording)
 
 
 def retuned_robot(robot: RobotDescription, retuned: Mapping[str, float]) -> RobotDescription:
