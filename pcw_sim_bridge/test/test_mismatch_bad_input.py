@@ -51,6 +51,7 @@ class Drive:
     velocity: np.ndarray
     effort: np.ndarray
     imu: bool = True
+    accelerometer: bool = True
     truth: bool = True
     source: Recording | None = None
 
@@ -70,7 +71,8 @@ class Drive:
             imu, truth = self.source.imu, self.source.ground_truth
             if self.imu and imu is not None:
                 for stamp, gyro, acceleration in zip(imu.stamp_ns.tolist(), imu.gyro, imu.acceleration, strict=True):
-                    writer.write("/imu/data", ros_messages.imu(stamp, gyro, acceleration), stamp)
+                    felt = acceleration if self.accelerometer else np.zeros(3)
+                    writer.write("/imu/data", ros_messages.imu(stamp, gyro, felt), stamp)
             if self.truth and truth is not None:
                 for stamp, pose, twist in zip(truth.stamp_ns.tolist(), truth.pose, truth.twist, strict=True):
                     writer.write("/ground_truth/odom", ros_messages.odometry(stamp, pose, twist), stamp)
@@ -148,6 +150,11 @@ def without_imu(drive: Drive) -> Drive:
     return dataclasses.replace(drive, imu=False)
 
 
+def without_accelerometer(drive: Drive) -> Drive:
+    """Of an IMU with a gyro alone most drivers leave the accelerations at zero."""
+    return dataclasses.replace(drive, accelerometer=False)
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -160,6 +167,7 @@ def without_imu(drive: Drive) -> Drive:
         pytest.param(velocity_in_counts, "counts", marks=pytest.mark.nightly),
         pytest.param(without_truth, "", marks=pytest.mark.nightly),
         pytest.param(without_imu, "", marks=pytest.mark.nightly),
+        (without_accelerometer, ""),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
@@ -177,8 +185,8 @@ def test_what_is_wrong_is_named_and_the_rest_is_used(
     if says:
         assert any(says in warning for warning in warnings), warnings
     else:
-        topic = "ground_truth/odom" if spoil is without_truth else "imu/data"
-        assert any(entry["sensor"] == topic for entry in report["absent"])
+        lacks = {without_truth: "ground_truth/odom", without_imu: "imu/data"}.get(spoil, "linear_acceleration in imu/data")
+        assert any(entry["sensor"] == lacks for entry in report["absent"])
 
 
 def test_a_missing_caster_is_named_and_the_others_are_used(

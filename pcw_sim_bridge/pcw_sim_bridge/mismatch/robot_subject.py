@@ -317,6 +317,8 @@ class RobotSubject:
                 ("effort in joint_states", _has_effort, cannot),
                 ("effort in joint_commands", _has_torque_commands, "dead times, lags and limits of the motors cannot be seen"),
                 ("imu/data", _has_imu, "slip of all wheels together, and faults of the sensor itself, cannot be seen"),
+                ("angular_velocity in imu/data", _has_gyro, "all wheels slipping as the robot turns cannot be seen"),
+                ("linear_acceleration in imu/data", _has_acceleration, "all wheels slipping at once cannot be seen"),
                 ("ground_truth/odom", _has_truth, "the path is the robot's own; what all wheels do wrong alike is not seen"),
             )
             if not all(map(there, recordings))
@@ -364,6 +366,16 @@ def _has_torque_commands(recording: Recording) -> bool:
 
 def _has_imu(recording: Recording) -> bool:
     return recording.imu is not None
+
+
+def _has_gyro(recording: Recording) -> bool:
+    """Whether an IMU, where there is one, has a gyro."""
+    return recording.imu is None or bool(np.isfinite(recording.imu.gyro).any())
+
+
+def _has_acceleration(recording: Recording) -> bool:
+    """Whether an IMU, where there is one, has an accelerometer."""
+    return recording.imu is None or bool(np.isfinite(recording.imu.acceleration).any())
 
 
 def _has_truth(recording: Recording) -> bool:
