@@ -176,17 +176,30 @@ def test_every_executable_stands_in_the_tables_of_the_readmes(package):
     assert set(re.findall(r"`(\w+)`", row)) == declared
 
 
-@pytest.mark.parametrize("readme", ["README.md", *(f"{package}/README.md" for package in PACKAGES)])
-def test_what_a_readme_names_is_there(readme):
-    """Every `ros2 run PACKAGE EXECUTABLE`, every `./pcw_bringup_scripts/...` command and every linked file."""
-    text = (REPOSITORY / readme).read_text(encoding="utf-8")
+WHERE_PAGES_LIE = ("README.md", "pcw_*/README.md", "pcw_*/docs/*.md")
+PAGES = sorted(path.relative_to(REPOSITORY).as_posix() for pattern in WHERE_PAGES_LIE for path in REPOSITORY.glob(pattern))
+
+
+def anchors_of(page: Path) -> set[str]:
+    """What links to a heading of a page call it, as the sites that show such pages form it."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_what_a_page_names_is_there(page):
+    """Every `ros2 run PACKAGE EXECUTABLE`, every `./pcw_bringup_scripts/...` command and every linked file and heading."""
+    text = (REPOSITORY / page).read_text(encoding="utf-8")
     for package, executable in re.findall(r"(?:ros2 run|pcw_bringup_scripts/run) +(pcw_\w+) +([a-z]\w*)", text):
         declared = (REPOSITORY / package / "setup.py").read_text(encoding="utf-8")
         assert f'"{executable} = {package}.' in declared, f"{package} has no executable {executable}"
     for path in re.findall(r"\./(pcw_bringup_scripts/[\w./]+)", text):
         assert (REPOSITORY / path).is_file(), path
-    for target in re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text):
-        assert ((REPOSITORY / readme).parent / target).exists(), target
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]*))?\)", text):
+        linked = (REPOSITORY / page).parent / target if target else REPOSITORY / page
+        assert linked.exists(), target
+        assert not anchor or anchor in anchors_of(linked), f"{target}#{anchor}"
 
 
 @pytest.mark.parametrize("package", PACKAGES)
