@@ -18,7 +18,9 @@ from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.explanation import Explanation, explain, strained_of_the_balance
 from pcw_sim_bridge.mismatch.findings import InputFinding
+from pcw_sim_bridge.mismatch.held_out import HeldOut
 from pcw_sim_bridge.mismatch.late_speed import lateness
+from pcw_sim_bridge.mismatch.proof import Prover
 from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
 from pcw_sim_bridge.mismatch.subject import Opened
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
@@ -162,6 +164,45 @@ def test_a_motor_that_gives_less_than_it_is_told() -> None:
     assert set(names) == {"torque_constant_error"} and found.leftovers == ()
     # Inertia and moment are known to 5 % each, and share what their description is off.
     assert names["torque_constant_error"]["error"] == pytest.approx(-0.3, abs=0.02)
+
+
+def test_frictions_beside_an_error_of_the_torque_constant_are_those_at_the_joint() -> None:
+    """They came out as large as they are reported, 1.4 times too large, and not within their intervals."""
+    truth = {COULOMB: ("coulomb", 0.05), VISCOUS: ("viscous", 0.03)}
+    _, found = explained("sines", coulomb=0.05, forwards=0.03, gain=0.7)
+    assert {named.term.effect for named in found.named} == {*truth, "torque_constant_error"} and found.leftovers == ()
+    axis, recording = recorded("sines", coulomb=0.05, forwards=0.03, gain=0.7)
+    for named in found.named:
+        parameter, value = truth.get(named.term.effect, ("error", -0.3))
+        estimate = named.estimates[parameter]
+        assert estimate.low < value < estimate.high and estimate.value == pytest.approx(value, rel=0.05)
+    # Of the simulated robot the same, and with all of them at work nothing is left of the recording.
+    folds = SimpleNamespace(proposed=range(3), instances=found.fit.instances, nuisances=len(found.search.problem.nuisances))
+    folds.span = lambda index: HeldOut.span(folds, index)  # type: ignore[arg-type]
+    prover = SimpleNamespace(laws=SimpleNamespace(laws={}), subject=AxisSubject(axis))
+    numbers = {"inertia": 0.0, "gravity_moment": 0.0, "hanging_position": 0.0}
+    patched = Prover._patched(prover, found.search.problem, folds, found.fit.mean, numbers, None).axis  # type: ignore
+    for named in found.named:
+        assert {e.name: e.parameters for e in patched.physics}[named.term.effect] == pytest.approx(named.effect.parameters)
+    left = [AxisProblemBuilder(one, [recording]).build(0.01) for one in (patched, axis)]
+    sizes = [float(np.std(problem.residual[problem.valid])) for problem in left]
+    assert sizes[0] < 0.15 * sizes[1]
+
+
+def test_an_error_of_the_torque_constant_beside_a_described_friction() -> None:
+    """What is described of the joint is reported in another size, too; it was an unknown law, or a Stribeck friction."""
+    for kind, gain in (("sines", 0.7), ("moves", 1.2)):
+        axis, recording = recorded(kind, coulomb=0.05, forwards=0.03, gain=gain)
+        known = (
+            EffectInstance(COULOMB, ("axis",), {"coulomb": 0.05, "asymmetry": 0.0, "smoothing_speed": 1e-3}),
+            EffectInstance(VISCOUS, ("axis",), {"viscous": 0.03, "asymmetry": 0.0}),
+        )
+        builder = AxisProblemBuilder(dataclasses.replace(axis, physics=known), [recording])
+        found = explain(builder.build(builder.choose_smoothing()), np.random.default_rng(0))
+        [named] = found.named
+        error = named.estimates["error"]
+        assert named.term.effect == "torque_constant_error" and found.leftovers == ()
+        assert error.low < gain - 1.0 < error.high and error.value == pytest.approx(gain - 1.0, abs=0.01)
 
 
 def test_an_error_of_the_torque_constant_may_be_a_load() -> None:

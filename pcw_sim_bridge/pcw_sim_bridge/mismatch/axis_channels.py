@@ -200,12 +200,15 @@ class AxisProblemBuilder:
         self._acceleration = self._variables["acceleration"]
         self._valid = self._filtered([m.still for m in self.motions]) < 0.1
         self._scans: dict[str, FloatArray] = {}
+        self._described: list[tuple[JointTorqueEffect, dict[str, float]]] = []
         self._plain_forces = self._explained_force((), in_channel=True, bare=True)
         self._smooth_forces = self._explained_force(())
         periodic = self._leading_periodic()
         self._smooth_forces = self._explained_force(periodic)
         self._smooth_forces = self._explained_force(periodic, with_load=True)
         self._shifted_forces = self._explained_force(periodic, with_load=True, in_channel=True)
+        self._described = self._described_effects()
+        self._plain_forces = self._with_described(self._plain_forces)
         self._periodic_columns = [self._columns(effect, shape)[:, 0, :] for effect, shape in periodic]
 
     def _filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
@@ -388,7 +391,8 @@ class AxisProblemBuilder:
         nuisances.append(
             Nuisance("clock_offset", "s", 0.0, _deviation(axis, "clock_offset", 1.0) * period, skew[:, None])
         )
-        predicted = predicted - self._described()
+        for described, given in self._described:
+            predicted = predicted - self._filtered(self._contributions(described, given))
         measured = self._force
         stamps = [self.filters[m.recording].decimate(m.time) for m in self.motions]
         start = {m.recording: m.time[0] for m in reversed(self.motions)}
@@ -418,34 +422,57 @@ class AxisProblemBuilder:
             remarks=self._mistaken_units(),
         )
 
-    def _described(self) -> FloatArray:
-        """What the effects of the description do to the axis (T,).
+    def _described_effects(self) -> list[tuple[JointTorqueEffect, dict[str, float]]]:
+        """The effects of the description that act on the axis, with their parameters.
 
         How fast a friction reverses is no physics: by a value that is not this axis's it would leave a Stribeck friction of
         about that speed. Where another one leaves less, that is taken.
         """
         described = [(all_effects()[instance.name], instance.parameters) for instance in self.axis.physics]
-        torques = [(effect, parameters) for effect, parameters in described if isinstance(effect, JointTorqueEffect)]
-
-        def does(changed: Mapping[str, float]) -> FloatArray:
-            total = np.zeros_like(self._force)
-            for effect, parameters in torques:
-                names = {p.name for p in effect.parameters}
-                own = {**parameters, **{name: value for name, value in changed.items() if name in names}}
-                total = total + self._filtered(self._contributions(effect, own))
-            return total
-
+        torques = [(effect, dict(given)) for effect, given in described if isinstance(effect, JointTorqueEffect)]
         if not self._valid.any() or not any(p.name == SMOOTHING for effect, _ in torques for p in effect.parameters):
-            return does({})
+            return torques
+
+        def smoothed(value: float) -> list[tuple[JointTorqueEffect, dict[str, float]]]:
+            return [
+                (effect, given | ({SMOOTHING: value} if SMOOTHING in {p.name for p in effect.parameters} else {}))
+                for effect, given in torques
+            ]
+
         velocity = self._variables["velocity"]
         beside = [self._acceleration, velocity, np.ones_like(velocity), self._skew(), *self._gravity()]
         known, _ = np.linalg.qr(np.stack(beside, axis=1)[self._valid])
 
-        def left(done: FloatArray) -> float:
-            force = (self._force + done)[self._valid]
+        def left(effects: Sequence[tuple[JointTorqueEffect, dict[str, float]]]) -> float:
+            does = np.sum([self._filtered(self._contributions(*effect)) for effect in effects], axis=0)
+            force = (self._force + self._reported_part * does)[self._valid]
             return float(np.sum((force - known @ (known.T @ force)) ** 2))
 
-        return min([does({}), *(does({SMOOTHING: value}) for value in self._smoothings())], key=left)
+        return min([torques, *(smoothed(float(value)) for value in self._smoothings())], key=left)
+
+    @functools.cached_property
+    def _reported_part(self) -> float:
+        """So large a part of what acts is reported as it is of inertia and gravity, by a motor of another torque constant."""
+        acting = self.axis.inertia * self._acceleration
+        if self.axis.gravity_arm is not None:
+            acting = acting + self.axis.gravity_arm.moment * self._gravity()[0]
+        acting, reported = acting[self._valid], self._filtered(self._plain_forces)[self._valid]
+        return float(np.clip(reported @ acting / max(float(acting @ acting), 1e-300), 1.0 / MISTAKEN, MISTAKEN))
+
+    def _with_described(self, forces: list[FloatArray]) -> list[FloatArray]:
+        """The forces of inertia and gravity, as they are reported, with those of what is described, at full rate."""
+        for effect, given in self._described_beside_gains() if self._valid.any() else ():
+            does = self._contributions(effect, given, self._smooth_forces)
+            forces = [force - self._reported_part * torque for force, torque in zip(forces, does, strict=True)]
+        return forces
+
+    def _described_beside_gains(self) -> list[tuple[JointTorqueEffect, dict[str, float]]]:
+        return [(effect, given) for effect, given in self._described if not _is_gain(effect)]
+
+    def _unsure_part(self) -> float:
+        """By which part an error of the torque constant is uncertain, as is how large described forces are reported."""
+        inertia = self.axis.inertia
+        return _deviation(self.axis, "inertia", inertia) / inertia if self._described_beside_gains() else 0.0
 
     def _smoothings(self) -> FloatArray:
         """Speeds over which frictions may reverse: one that takes more than a twentieth of the top speed is not dry."""
@@ -516,20 +543,19 @@ class AxisProblemBuilder:
         return Sites(("axis_force",), variables, smoothing, columns, angles, max(m.slow for m in motions))
 
     def _contributions(
-        self, effect: JointTorqueEffect, parameters: dict[str, float] | Shape
+        self, effect: JointTorqueEffect, parameters: dict[str, float] | Shape, forces: Sequence[FloatArray] | None = None
     ) -> list[FloatArray]:
-        zero = [np.zeros_like(m.position) for m in self.motions]
+        """What an effect does at full rate, with the measured forces or others."""
         return [
-            effect.contribution(m.position, m.velocity, m.force, z, parameters)
-            for m, z in zip(self.motions, zero, strict=True)
+            effect.contribution(m.position, m.velocity, force, np.zeros_like(force), parameters)
+            for m, force in zip(self.motions, forces or [m.force for m in self.motions], strict=True)
         ]
 
     def _columns(self, effect: JointTorqueEffect, shape: Shape) -> FloatArray:
         """Exact columns (T, 1, P): what one unit of each linear parameter adds to the force the motor must give."""
         per_motion = []
-        gain_only = kernel_arguments(effect.name) == ("force",)
         for m, force in zip(
-            self.motions, self._plain_forces if gain_only else self._smooth_forces, strict=True
+            self.motions, self._plain_forces if _is_gain(effect) else self._smooth_forces, strict=True
         ):
             by_name = effect.regressor(m.position, m.velocity, force, np.zeros_like(force), shape)
             per_motion.append(-np.stack([by_name[p.name] for p in effect.linear_parameters], axis=1))
@@ -564,6 +590,7 @@ class AxisProblemBuilder:
             effect=effect.name,
             log_prior=effect.log_prior,
             target=(TARGET,),
+            unsure={p.name: self._unsure_part() for p in effect.linear_parameters} if _is_gain(effect) else {},
             parameters=parameters,
             shapes=tuple(shapes),
             columns=columns,
@@ -655,6 +682,10 @@ def travel_since_reversal(position: FloatArray, velocity: FloatArray, slow: floa
 def _deviation(axis: AxisDescription, name: str, nominal: float) -> float:
     tolerance = axis.tolerance(name)
     return tolerance.value * abs(nominal) if tolerance.relative else tolerance.value
+
+
+def _is_gain(effect: JointTorqueEffect) -> bool:
+    return kernel_arguments(effect.name) == ("force",)
 
 
 @functools.cache

@@ -27,6 +27,7 @@ from scipy import stats
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects, get
 
+from .acting_torques import is_reported, place_of_error
 from .effect_gates import EffectGates
 from .evidence_selection import EffectSearch, Selection
 from .found_effect import effect_instance
@@ -662,7 +663,7 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
     beside_all = {(s.index, s.name): (s, float(d)) for s, d in zip(slopes, deviations[len(fit.mean) :], strict=True)}
     widening = np.maximum(np.diag(misfit) / np.maximum(np.diag(known.covariance), 1e-300), 1.0)
     numbers = [nuisance.name for nuisance in problem.nuisances]
-    position = len(numbers)
+    position, error = len(numbers), place_of_error(problem, fit.instances)
     named = []
     for index, instance in enumerate(fit.instances):
         term = problem.terms[instance.term]
@@ -672,8 +673,13 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
             if parameter.hidden:
                 continue
             parts = [position + offset, *(numbers.index(name) for name in numbers if name == parameter.number)]
-            value = float(fit.mean[parts].sum())
-            variance = max(float(covariance[np.ix_(parts, parts)].sum()) for covariance in (whole, misfit))
+            value, gradient = float(fit.mean[parts].sum()), np.zeros(len(known.mean))
+            gradient[parts] = 1.0
+            if error is not None and is_reported(term):
+                gradient *= 1.0 + float(fit.mean[error])
+                gradient[error] = value
+                value *= 1.0 + float(fit.mean[error])
+            variance = max(float(gradient @ covariance @ gradient) for covariance in (whole, misfit))
             power = problem.powers.get((instance.term, instance.shape, parameter_index), 1.0)
             within = search.taken_over.get((instance.term, parameter_index), 0.0)
             relative = math.hypot(problem.scale_deviation / power, term.unsure.get(parameter.name, 0.0))

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, optimize
 
+from .acting_torques import acting_part
 from .all_cores import on_all_cores
 from .evidence_selection import EffectSearch, Selection
 from .law_search import LAW_MARGIN, FoundLaw, LawSearch, changes_law_of, gain_of_a_smaller_law
@@ -466,6 +467,8 @@ def _is_fitted(search: EffectSearch, selection: Selection, law: Law) -> bool:
 
 def _law_leftover(search: EffectSearch, selection: Selection, law: Law, found: FoundLaw) -> Leftover:
     weights, _ = _weights_of(search, selection, law)
+    if law.sites == ("axis_force",):
+        weights = weights * acting_part(search.problem, selection.fit.instances, selection.fit.mean)
     knots = law.basis.knots[0]
     grid = np.linspace(knots[0], knots[-1], 61)
     if len(law.basis.knots) == 1:

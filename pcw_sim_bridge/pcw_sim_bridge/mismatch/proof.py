@@ -17,6 +17,7 @@ from pcw_description.effects.kinds import TransmissionEffect
 from pcw_description.effects.registry import also_known, get
 from pcw_description.errors import PcwError
 
+from .acting_torques import acting_part, is_reported
 from .all_cores import on_all_cores
 from .errors import MismatchError
 from .explanation import AMBIGUOUS, Explanation
@@ -529,11 +530,13 @@ class Prover:
         """The description with the effects, laws and numbers of one fold, for a simulator that knows the laws."""
         effects = []
         changes = dict(zip((n.name for n in problem.nuisances), mean.tolist(), strict=False))
+        acting = acting_part(problem, held_out.instances, mean)
         for index in held_out.proposed:
             if index == without:
                 continue
             instance = held_out.instances[index]
-            values = mean[slice(*held_out.span(index))]
+            values = mean[slice(*held_out.span(index))].copy()
+            values *= acting if is_reported(problem.terms[instance.term]) else 1.0
             if instance in self.laws.laws:
                 law = self.laws.simulated(instance, values)
                 effects += [law] if law is not None else []
