@@ -205,7 +205,8 @@ class AxisProblemBuilder:
         self._smooth_forces = self._explained_force(())
         periodic = self._leading_periodic()
         self._smooth_forces = self._explained_force(periodic)
-        self._smooth_forces = self._explained_force(periodic, with_load=True)
+        self._shifted_forces = self._explained_force(periodic, with_load=True, in_channel=True)
+        self._smooth_forces = self._forces_of_loads(periodic)
         self._shifted_forces = self._explained_force(periodic, with_load=True, in_channel=True)
         self._described = self._described_effects()
         self._plain_forces = self._with_described(self._plain_forces)
@@ -270,6 +271,32 @@ class AxisProblemBuilder:
             # is late by half a sample is none, and would tell how large the error is.
             scaled[1:4] = 0.0
         return [part @ scaled for part in parts]
+
+    def _forces_of_loads(self, periodic: Sequence[tuple[JointTorqueEffect, Shape]]) -> list[FloatArray]:
+        """The explained force at full rate as the magnitude is taken of it that a gear rubs by.
+
+        In the wider band the noise of an acceleration makes that too large where the force is small, and the force too smooth;
+        smoothed to the channel it is that of the motor. A gear that rubs by both its sides may follow another one: where that
+        leaves less, it is taken.
+        """
+        wide = self._explained_force(periodic, with_load=True)
+        if not self._valid.any():
+            return wide
+        smooth = [self.filters[m.recording].smooth(f) for m, f in zip(self.motions, self._shifted_forces, strict=True)]
+        velocity = self._variables["velocity"]
+        signs = self._signs()
+        fixed = [self._acceleration, velocity, np.ones_like(velocity), self._skew(), *self._gravity(), self._filtered(signs)]
+
+        def left(forces: Sequence[FloatArray]) -> float:
+            loads = self._filtered([np.abs(force) * sign for force, sign in zip(forces, signs, strict=True)])
+            return self._misfit([column[:, None] for column in (*fixed, loads)])
+
+        return min([wide, smooth], key=left)
+
+    def _signs(self) -> list[FloatArray]:
+        """Direction of the motion at full rate, roughly."""
+        top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.99)), 1e-12)
+        return [np.tanh(m.velocity / (0.02 * top)) for m in self.motions]
 
     def choose_smoothing(self) -> float:
         """Return the speed over which frictions reverse on this axis [m/s or rad/s], by least squares."""
@@ -487,8 +514,7 @@ class AxisProblemBuilder:
         """
         if not self._valid.any():
             return 0.0
-        top = max(float(np.quantile(np.abs(self._variables["velocity"]), 0.99)), 1e-12)
-        signs = [np.tanh(m.velocity / (0.02 * top)) for m in self.motions]
+        signs = self._signs()
         loads = [np.abs(force) * sign for force, sign in zip(self._smooth_forces, signs, strict=True)]
         columns = [self._filtered(frictions) for frictions in (signs, loads)]
         columns += [self._acceleration, self._variables["velocity"], np.ones(len(self._valid)), *self._gravity()]
