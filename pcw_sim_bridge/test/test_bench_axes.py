@@ -254,6 +254,17 @@ def test_a_spring_is_no_row_of_waves_that_are_longer_than_its_travel() -> None:
     assert left.expression is not None and left.expression.endswith("position**3")
 
 
+def test_a_slow_spring_and_a_friction_do_not_hide_each_other() -> None:
+    """To either alone the other was slow noise, and nothing was named; together they explain nearly everything."""
+    explanation = found_beyond(lambda angle, speed: 0.01 * angle + 0.005 * speed)
+    [named], [left] = explanation.named, explanation.leftovers
+    assert named.term.effect == VISCOUS
+    assert named.estimates["viscous"].value == pytest.approx(0.005, rel=0.02)
+    assert left.depends_on == ("position",) and left.expression is not None
+    size = re.fullmatch(r"axis_force = (-[\d.]+) position", left.expression)
+    assert size is not None and float(size[1]) == pytest.approx(-0.01, rel=0.02)
+
+
 def with_signals(case: BenchCase, position: np.ndarray, force: np.ndarray) -> AxisProblemBuilder:
     """Return the builder of a case with other signals in its recording."""
     recordings = [dataclasses.replace(case.recordings[0], position=position, force=force)]

@@ -137,6 +137,7 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
         law = LawSearch(search, selection).run()
         if law is None:
             break
+        selection, law = _beside_hidden_name(search, selection, law)
         if not law.counts:
             beliefs = {i.term: law.belief for i in law.withdrawn}
             doubts = _doubts(search, law)
@@ -282,6 +283,35 @@ def _in_library(search: EffectSearch, selection: Selection, found: FoundLaw) -> 
             search.progress(f"in the library after all: {search.label(trial[-1])}")
             return chosen
     return None
+
+
+def _beside_hidden_name(search: EffectSearch, selection: Selection, law: FoundLaw) -> tuple[Selection, FoundLaw]:
+    """The selection with a name that shows only beside a law, and the law that counts beside it; if there are such.
+
+    Of two things that are missing each is slow noise to the other: a spring does not count where a friction is not named, nor
+    that where the spring is not known. A robot's channels are many, and do not hide the same.
+    """
+    if law.counts or law.law.sites != ("axis_force",):
+        return selection, law
+    terms, names = search.problem.terms, selection.fit.instances
+    wider, with_law = _with_law(search, selection, law.law, names)
+    instances, trials = with_law.fit.instances, []
+    for candidate in with_law.regression.scan(instances, only=range(len(terms)))[0][:LIBRARY_TRIALS]:
+        term = terms[candidate.instance.term]
+        mends = bool(term.arguments) and set(term.arguments) <= set(law.law.depends_on)
+        if mends or term.repeatable or term.effect == UNKNOWN or wider.repeats(candidate.instance, instances):
+            continue
+        name = refined_shape(with_law.regression, instances, candidate.instance)
+        regression = wider.whiten_beside((name, *instances))
+        trials.append((regression.fit((name, *instances)).log_evidence - regression.fit(instances).log_evidence, name))
+    if not trials:
+        return selection, law
+    gain, name = max(trials, key=lambda trial: trial[0])
+    if gain < selection.threshold:
+        return selection, law
+    beside = search.conclude((*names, name), selection.threshold)
+    found = LawSearch(search, beside).run()
+    return (beside, found) if found is not None and found.counts else (selection, law)
 
 
 def _with_names_beside(search: EffectSearch, selection: Selection) -> Selection:
