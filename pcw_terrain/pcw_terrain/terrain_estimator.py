@@ -26,7 +26,7 @@ The covariance is that of these equations. Noise goes on from block to block: th
 the wheel's acceleration with the opposite one, as what one block gains its neighbour loses, so that next to nothing of it is
 left in the sum. Both follow from the measured noise, filter and tyre (`block_shares`, `ends_share`), and so the variance of
 sum w z r is sum over k and l of w_k z_k w_l z_l C(k, l), and so on. What residuals are beyond that noise counts with the
-correlation that they have.
+correlation that they have. The spread of lambda_p is as wide as the second equation holds within its noise, on its wider side.
 
 An estimate is valid when it is narrow enough, the slip has been beyond `least_slip` of the largest lambda_p that it allows,
 and the force acted along the slip and not against it. One slip that is held gives one equation for two numbers, and the second
@@ -81,7 +81,13 @@ GREATEST_NOISE = 0.35
 INFORMATIVE_SLIP = 0.3
 UNSTEADY_SLIP = 0.25
 # Slip and force of a block belong together to this part of what the slip moves by from block to block, without any noise.
-MOVING_ACCURACY = 0.1
+MOVING_ACCURACY = 0.15
+# Blocks are weighted by the peak friction that those say in which slip and force stand out of their noise by so many standard
+# deviations, and by what floors have before there are any. Of a wheel that coasts, noise would say that there is no friction:
+# slip would then cost nothing, and such blocks would outweigh those that follow.
+FELT_DEVIATIONS, USUAL_FRICTION, USUAL_SPREAD = 3.0, 0.5, 0.25
+# The spread of lambda_p is that of this many standard deviations of the second equation, on its wider side.
+INTERVAL_DEVIATIONS = 1.96
 # Degrees of freedom that the expected size of the residuals counts for, besides those of the residuals.
 PRIOR_BLOCKS = 5.0
 # Mean squares of residuals that are larger by so many of their standard deviations may be so by chance.
@@ -131,15 +137,18 @@ _CHANGES, _CHANGE_TIME, _SLIP, _FRICTION, _SLIP_NOISE, _OPENED, _CUMULATED = ran
 # the rolling speed at its beginning.
 _MEAN, _BLOCK_TIME, _BEGAN_AT = 45, 52, 53
 _RESULT = 54  # mu_p, lambda_p, variances of their logarithms and covariance, valid, misfit, reason
-_HISTORY, _BLOCK = 16, 15  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
+_HISTORY, _BLOCK = 16, 16  # blocks kept: slip, variance, friction, variance, time, usable, what bends the curve, lag of the
 # instrument, whether it has been added, residual in standard deviations; noise of the slip per unit of its gain, rate of the
-# tyre's relaxation (0: none), noise of the friction by the wheel's acceleration and by the force, sign of the force
+# tyre's relaxation (0: none), noise of the friction by the wheel's acceleration and by the force, sign of the force; variance
+# of the slip without what moves
 _KNOWN_FOR, _MISFITS = 62, 63  # time for which every reading has been known [s]; blocks in a row of which none fits
 _TAKEN = 64  # blocks taken so far, modulo PAIRS; then time and sign of each of the last ones
 _WAY, _ABOVE = _TAKEN + 1 + 2 * PAIRS, _TAKEN + 2 + 2 * PAIRS  # rolled since a block said something [m]; see ABOVE_BLOCKS
 _AVERAGE, _AVERAGED, _AVERAGES = _ABOVE + 1, _ABOVE + 3, _ABOVE + 4  # sums of speeds for such a mean, how many, means so far
-_STATE = _AVERAGES + 1
-_PAIRED = 20  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
+_SQUARE = _AVERAGES + 1  # means of the squares of both speeds over the time of their noise [m^2/s^2]
+_RATIO_X, _RATIO_Y = _SQUARE + 2, _SQUARE + 3  # slip of the reading before, along and across, not relaxed
+_STATE = _SQUARE + 4
+_PAIRED = 27  # then, of each of the last blocks: both weighted functions, slope and bend of the curve
 _SUMS = _PAIRED + 4 * PAIRS
 # Columns of what `TerrainEstimator.run` returns.
 RESULTS = 14
@@ -147,7 +156,8 @@ MU_P, LAMBDA_P, MU_VARIANCE, COVARIANCE, LAMBDA_VARIANCE, IS_VALID, MISFIT, REAS
 FRICTION, SLIP_NOISE, SINCE_CHANGE, SUSPECT = range(10, RESULTS)
 (
     _ZZ, _ZA, _AA, _ZY, _ZG, _AY, _AG, _YY, _GY, _GG, _LOG, _BEYOND, _W, _NOISE_ZZ, _NOISE_ZA, _NOISE_AA, _NOISE_SHARE,
-    _STEADY_ZZ, _STEADY_ZA, _STEADY_AA,
+    _SLIP_ZZ, _SLIP_ZA, _SLIP_AA, _SLIP_SHARE, _STEADY_ZZ, _STEADY_ZA, _STEADY_AA,
+    _FELT_ZZ, _FELT_ZY, _FELT_ZG,
 ) = range(_PAIRED)  # fmt: skip
 
 # Why an estimate is not valid, or 0.
@@ -364,6 +374,17 @@ def _grid(j):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _square_of_friction(sums, j):  # type: ignore[no-untyped-def]
+    """Return the mean of mu_p^2 at a lambda_p of the grid, as far as felt friction tells; see `FELT_DEVIATIONS`."""
+    usual = 1.0 / USUAL_SPREAD**2
+    share = max(sums[j, _FELT_ZG], 0.0) / max(sums[j, _FELT_ZZ], 1e-300)
+    information = share * sums[j, _FELT_ZG] + usual
+    mu = (share * sums[j, _FELT_ZY] + usual * USUAL_FRICTION) / information
+    mu = min(max(mu, LEAST_FRICTION), GREATEST_FRICTION)
+    return mu * mu + 1.0 / information
+
+
+@compiled
 def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged, spread):  # type: ignore[no-untyped-def]
     """Add one block of the history to the sums of every lambda_p.
 
@@ -382,6 +403,8 @@ def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged
     of_slip *= now[10]
     for m in range(3):
         of_friction[m] = now[12] * ends_share(m) + now[13] * of_force[m]
+    # What does not belong together of a slip that moves.
+    moving = max(slip_variance - now[15], 0.0)
     shared = lag_signs * of_slip[min(apart, PAIRS - 1)]
     best = state[_RESULT + 1]
     informative = 1.0
@@ -396,6 +419,9 @@ def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged
     for i in range(PAIRS):
         ago[i] = round(abs(now[4] - state[_TAKEN + 1 + 2 * i]) / time)
         alike[i] = now[14] * state[_TAKEN + 2 + 2 * i]
+    # The instrument is the mean of two blocks.
+    felt = abs(lag) > FELT_DEVIATIONS * math.sqrt(0.5 * slip_variance)
+    felt = felt and abs(friction) > FELT_DEVIATIONS * math.sqrt(friction_variance)
     for j in range(GRID):
         critical = _grid(j)
         x, x_lag = slip / critical, lag / critical
@@ -405,14 +431,12 @@ def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged
         corrected = g - 0.5 * bend * bending * per_square
         z, slope, bend_lag = shape_at(table, x_lag)
         a = -x_lag * slope
-        mu = 0.5
-        if sums[j, _ZG] > 0.0:
-            mu = min(max(sums[j, _ZY] / sums[j, _ZG], LEAST_FRICTION), GREATEST_FRICTION)
-        variance = friction_variance + mu * mu * s2 * (slope * slope + bend_lag * bend_lag * s2)
+        square = _square_of_friction(sums, j)
+        variance = friction_variance + square * s2 * (slope * slope + bend_lag * bend_lag * s2)
         w = 1.0 / variance
         # How well the curve fits is judged by the slope at the block itself as well: weights that know its noise would bias.
         steep, bent = max(slope * slope, slope_now * slope_now), max(bend * bend, bend_lag * bend_lag)
-        spread_here = friction_variance + mu * mu * s2 * (steep + 0.5 * bent * s2)
+        spread_here = friction_variance + square * s2 * (steep + 0.5 * bent * s2)
         sure = 1.0 / spread_here
         for k in range(_PAIRED):
             sums[j, k] *= keep
@@ -427,6 +451,10 @@ def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged
         sums[j, _STEADY_AA] += w * bent_a * bent_a * tremble
         sums[j, _ZY] += w * z * friction
         sums[j, _ZG] += w * (z * corrected - slope * slope_now * shared * per_square)
+        if felt:
+            sums[j, _FELT_ZZ] += w * z * z
+            sums[j, _FELT_ZY] += w * z * friction
+            sums[j, _FELT_ZG] += w * (z * corrected - slope * slope_now * shared * per_square)
         sums[j, _AY] += w * a * friction
         sums[j, _AG] += w * (a * corrected + (slope + x_lag * bend_lag) * slope_now * shared * per_square)
         sums[j, _YY] += sure * friction * friction
@@ -437,24 +465,35 @@ def _add_block(table, numbers, state, sums, now, lag, apart, lag_signs, averaged
         if abs(averaged) - 3.0 * spread >= numbers[_LEAST_SLIP] * critical:
             sums[j, _BEYOND] += 1.0
         # What the measured noise of this block and of those before it makes of both equations. The square of a slope that was
-        # taken at a noisy slip is too large by bend^2 noise; what noise does by the bend itself is half of that.
+        # taken at a noisy slip is too large by bend^2 noise; what noise does by the bend itself is half of that, and is there.
+        # What slip makes goes with mu_p^2, which is not known yet.
         noise = of_slip[0] * per_square
-        own = of_friction[0] + mu * mu * noise * (slope_now * slope_now - 0.5 * bend * bend * noise)
+        by_bend = 0.5 * bend * bend * noise
+        by_slip = noise * max(slope_now * slope_now - by_bend, by_bend)
+        by_slip += moving * per_square * max(slope_now * slope_now, slope * slope)
         p, q = w * z, w * a
-        sums[j, _NOISE_ZZ] += own * p * p
-        sums[j, _NOISE_ZA] += own * p * q
-        sums[j, _NOISE_AA] += own * q * q
-        sums[j, _NOISE_SHARE] += own * w
+        sums[j, _NOISE_ZZ] += of_friction[0] * p * p
+        sums[j, _NOISE_ZA] += of_friction[0] * p * q
+        sums[j, _NOISE_AA] += of_friction[0] * q * q
+        sums[j, _NOISE_SHARE] += of_friction[0] * w
+        sums[j, _SLIP_ZZ] += by_slip * p * p
+        sums[j, _SLIP_ZA] += by_slip * p * q
+        sums[j, _SLIP_AA] += by_slip * q * q
+        sums[j, _SLIP_SHARE] += by_slip * w
         for i in range(PAIRS):
             m = ago[i]
             if 0 < m < PAIRS:
                 at = _PAIRED + 4 * i
                 noise = of_slip[m] * per_square
-                both = mu * mu * noise * (slope_now * sums[j, at + 2] - 0.5 * bend * sums[j, at + 3] * noise)
-                both = alike[i] * (both + of_friction[m])
-                sums[j, _NOISE_ZZ] += 2.0 * both * p * sums[j, at]
-                sums[j, _NOISE_ZA] += both * (p * sums[j, at + 1] + q * sums[j, at])
-                sums[j, _NOISE_AA] += 2.0 * both * q * sums[j, at + 1]
+                by_slip = alike[i] * noise * (slope_now * sums[j, at + 2] - 0.5 * bend * sums[j, at + 3] * noise)
+                by_friction = alike[i] * of_friction[m]
+                zz, za, aa = 2.0 * p * sums[j, at], p * sums[j, at + 1] + q * sums[j, at], 2.0 * q * sums[j, at + 1]
+                sums[j, _NOISE_ZZ] += by_friction * zz
+                sums[j, _NOISE_ZA] += by_friction * za
+                sums[j, _NOISE_AA] += by_friction * aa
+                sums[j, _SLIP_ZZ] += by_slip * zz
+                sums[j, _SLIP_ZA] += by_slip * za
+                sums[j, _SLIP_AA] += by_slip * aa
         at = _PAIRED + 4 * taken
         sums[j, at], sums[j, at + 1], sums[j, at + 2], sums[j, at + 3] = p, q, slope_now, bend
     state[_TAKEN + 1 + 2 * taken], state[_TAKEN + 2 + 2 * taken] = now[4], now[14]
@@ -476,6 +515,47 @@ def _varied(sums, j, allowed):  # type: ignore[no-untyped-def]
     by_noise = sums[j, _STEADY_AA] - 2.0 * share * sums[j, _STEADY_ZA] + share * share * sums[j, _STEADY_ZZ]
     by_chance = VARIED_CHANCE * math.sqrt(2.0 / max(sums[j, _W], 1.0))
     return apart * allowed * allowed > (VARIED + by_chance) * by_noise
+
+
+@compiled
+def _noise_of_equations(sums, j, mu, noise, rest):  # type: ignore[no-untyped-def]
+    """Return variances and covariance of both equations at a lambda_p of the grid: zz, za, aa.
+
+    `noise` is by how much the measured noise counts, `rest` the part of the residuals' variance that it does not explain.
+    """
+    square = mu * mu
+    zz = noise * max(sums[j, _NOISE_ZZ] + square * sums[j, _SLIP_ZZ], 0.0) + rest * sums[j, _ZZ]
+    za = noise * (sums[j, _NOISE_ZA] + square * sums[j, _SLIP_ZA]) + rest * sums[j, _ZA]
+    aa = noise * max(sums[j, _NOISE_AA] + square * sums[j, _SLIP_AA], 0.0) + rest * sums[j, _AA]
+    return zz, za, aa
+
+
+@compiled
+def _second_variance(sums, j, zz, za, aa):  # type: ignore[no-untyped-def]
+    """Return the variance of the second equation, of which the first has taken mu_p, and what it takes of that."""
+    share = sums[j, _AG] / sums[j, _ZG]
+    return max(aa - 2.0 * share * za + share * share * zz, 1e-300), share
+
+
+@compiled
+def _holds_as_far_as(sums, left, part, side, noise, rest):  # type: ignore[no-untyped-def]
+    """Return how far from its root, at left + part, the second equation still holds within its noise [steps of the grid].
+
+    `side` is 1 for larger lambda_p and -1 for smaller ones. Where a few blocks tell lambda_p the equation is no straight line,
+    and its slope at the root, which has the same noise in it, says too little of what else is possible.
+    """
+    root = left + part
+    j, before, at = (left + 1 if side > 0 else left), 0.0, root
+    while 0 <= j < GRID and sums[j, _ZG] > 0.0:
+        mu, h = _equation(sums, j)
+        zz, za, aa = _noise_of_equations(sums, j, mu, noise, rest)
+        variance, _ = _second_variance(sums, j, zz, za, aa)
+        deviations = abs(h) / math.sqrt(variance)
+        if deviations >= INTERVAL_DEVIATIONS:
+            return abs(at + (j - at) * (INTERVAL_DEVIATIONS - before) / (deviations - before) - root)
+        before, at = deviations, float(j)
+        j += side
+    return abs(at - root)
 
 
 @compiled
@@ -531,17 +611,17 @@ def _solve(numbers, state, sums):  # type: ignore[no-untyped-def]
     scale = (PRIOR_BLOCKS + max(squares, 0.0)) / (PRIOR_BLOCKS + max(count - 2.0, 0.0))
     # Noise that was measured counts as it goes from block to block; what the residuals are beyond it, and beyond what chance
     # makes of so many, goes together as they do.
-    explained = sums[j, _NOISE_SHARE] / max(sums[j, _W], 1.0)
+    explained = (sums[j, _NOISE_SHARE] + mu * mu * sums[j, _SLIP_SHARE]) / max(sums[j, _W], 1.0)
     noise = min(1.0 + CHANCE * math.sqrt(2.0 / max(count, 1.0)), scale / max(explained, 1e-12))
     rest = max(scale - noise * explained, 0.0)
     correlation = min(max(state[_CORRELATION], 0.0), 0.8)
     rest *= (1.0 + correlation) / (1.0 - correlation)
-    zz = noise * max(sums[j, _NOISE_ZZ], 0.0) + rest * sums[j, _ZZ]
-    za = noise * sums[j, _NOISE_ZA] + rest * sums[j, _ZA]
-    aa = noise * max(sums[j, _NOISE_AA], 0.0) + rest * sums[j, _AA]
-    share = sums[j, _AG] / sums[j, _ZG]
-    h_variance = max(aa - 2.0 * share * za + share * share * zz, 1e-300)
+    zz, za, aa = _noise_of_equations(sums, j, mu, noise, rest)
+    h_variance, share = _second_variance(sums, j, zz, za, aa)
     slip_variance = h_variance / (slope * slope)
+    for side in (-1, 1):
+        far = _holds_as_far_as(sums, left, part, side, noise, rest) * step / INTERVAL_DEVIATIONS
+        slip_variance = max(slip_variance, far * far)
     own = zz / (sums[j, _ZG] * mu) ** 2
     together = (za - share * zz) / (sums[j, _ZG] * mu)
     mu_variance = own + follows * follows * slip_variance - 2.0 * follows / slope * together
@@ -590,10 +670,21 @@ def _begin_anew(state, sums, history):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _speed_noise(numbers, state, k):  # type: ignore[no-untyped-def]
+    """Return the variance of one reading of rolling speed (k = 0) or velocity (1) in the block that ends now.
+
+    Noise may grow with the speed. Where that has grown meanwhile, the mean over the last time is too small.
+    """
+    speed = state[_MEAN + k] / state[_BLOCK_TIME]
+    return state[_NOISE + k] * max(speed * speed / max(state[_SQUARE + k], numbers[_LEAST_SPEED] ** 2), 1.0)
+
+
+@compiled
 def _friction_noise(numbers, state, full_gain, load):  # type: ignore[no-untyped-def]
     """Return the noise of a block's friction by the wheel's acceleration and by the force, each per unit of its share."""
     per_time = numbers[_INERTIA] / state[_BLOCK_TIME]
-    return full_gain * per_time * per_time * state[_NOISE] / (load * load), full_gain * state[_NOISE + 2] / (load * load)
+    gain = full_gain / (load * load)
+    return gain * per_time * per_time * _speed_noise(numbers, state, 0), gain * state[_NOISE + 2]
 
 
 @compiled
@@ -732,7 +823,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     along = force_x / force
     # Of lambda = 1 - v / (r rho_dot), and of its mirror in braking.
     other = min(abs(rolling), abs(velocity)) / speed
-    larger, smaller = state[_NOISE], state[_NOISE + 1]
+    larger, smaller = _speed_noise(numbers, state, 0), _speed_noise(numbers, state, 1)
     if abs(velocity) > abs(rolling):
         larger, smaller = smaller, larger
     relaxing, relaxed_blocks = math.inf, 0
@@ -757,7 +848,7 @@ def _block(table, numbers, state, sums, history, pole, dt):  # type: ignore[no-u
     # What does not average out spreads the residuals as well.
     now[1] += numbers[_SLIP_ACCURACY] ** 2
     now[10], now[11], now[12], now[13] = noise, relaxing if relaxing < math.inf else 0.0, ends_unit, force_unit
-    now[14] = sign
+    now[14], now[15] = sign, now[1]
     # The mean of a curve is bent by noise, and the mean friction by slip that moves within the filter's memory, 2 / pole^2.
     now[6] = slip_variance
     if history[_HISTORY - 2, 5] > 0.0:
@@ -803,7 +894,10 @@ def _note_noise(state, k, now, count, dt, before_it):  # type: ignore[no-untyped
         # The second difference of white noise has six times its variance; a smooth signal has next to none.
         square = count * (now - 2.0 * latest + before) ** 2 / 6.0
         forgotten = 1.0 - math.exp(-count * dt / NOISE_MEMORY)
-        state[_NOISE + k] += max(forgotten, 1.0 / (before_it - 1.0)) * (square - state[_NOISE + k])
+        forgotten = max(forgotten, 1.0 / (before_it - 1.0))
+        state[_NOISE + k] += forgotten * (square - state[_NOISE + k])
+        if k < 2:
+            state[_SQUARE + k] += forgotten * (latest * latest - state[_SQUARE + k])
     state[_BEFORE + 2 * k], state[_BEFORE + 2 * k + 1] = latest, now
 
 
@@ -845,22 +939,31 @@ def advance(table, numbers, state, sums, history, reading, dt):  # type: ignore[
     state[_NOISE_TIME] += dt
     speed = max(abs(state[_ROLLING + 1]), abs(state[_VELOCITY + 1]), 1e-3)
     slip_x, slip_y = state[_ROLLING + 1] - state[_VELOCITY + 1], state[_SLIP_Y + 1]
+    ratio_x, ratio_y, before_x, before_y = slip_x / speed, slip_y / speed, state[_Z_X], state[_Z_Y]
+    lead_x, lead_y = 0.0, 0.0
     if numbers[_RELAXATION] > 0.0:
-        relaxed = 1.0 - math.exp(-dt * speed / numbers[_RELAXATION])
-        state[_Z_X] += relaxed * (slip_x / speed - state[_Z_X])
-        state[_Z_Y] += relaxed * (slip_y / speed - state[_Z_Y])
+        # The slip goes straight from one reading to the next.
+        passed = dt * speed / numbers[_RELAXATION]
+        relaxed = 1.0 - math.exp(-passed)
+        follows = 1.0 - relaxed / passed
+        if first:
+            state[_RATIO_X], state[_RATIO_Y] = ratio_x, ratio_y
+        state[_Z_X] += relaxed * (state[_RATIO_X] - state[_Z_X]) + follows * (ratio_x - state[_RATIO_X])
+        state[_Z_Y] += relaxed * (state[_RATIO_Y] - state[_Z_Y]) + follows * (ratio_y - state[_RATIO_Y])
         # The tyre's damping leads the force; see `contact_model`.
         lead = DAMPING_TIME * speed / numbers[_RELAXATION]
-        lead_x, lead_y = lead * (slip_x / speed - state[_Z_X]), lead * (slip_y / speed - state[_Z_Y])
+        lead_x, lead_y = lead * (ratio_x - state[_Z_X]), lead * (ratio_y - state[_Z_Y])
+        state[_RATIO_X], state[_RATIO_Y] = ratio_x, ratio_y
     else:
-        lead_x, lead_y = 0.0, 0.0
-        state[_Z_X], state[_Z_Y] = slip_x / speed, slip_y / speed
+        state[_Z_X], state[_Z_Y] = ratio_x, ratio_y
+    # A torque is that since the reading before, in the mean half a step old; so is the slip that belongs to it.
+    back = 0.5 if numbers[_INERTIA] > 0.0 and not first else 0.0
     state[_SINCE_BLOCK] += dt
     if state[_BLOCK_TIME] == 0.0:
         state[_BEGAN_AT] = began_at
     means = (
         state[_ROLLING + 1], state[_VELOCITY + 1], state[_FORCE + 1], state[_FORCE_Y + 1], state[_LOAD + 1],
-        state[_Z_X] + lead_x, state[_Z_Y] + lead_y,
+        state[_Z_X] + back * (before_x - state[_Z_X]) + lead_x, state[_Z_Y] + back * (before_y - state[_Z_Y]) + lead_y,
     )  # fmt: skip
     for k in range(7):
         state[_MEAN + k] += dt * means[k]
