@@ -39,6 +39,7 @@ from .terrain_estimator import (
     SUSPECT,
     TerrainParameters,
     TerrainState,
+    ground_force,
     initial_state,
     run_wheels,
 )
@@ -272,7 +273,11 @@ class RobotTerrain:
         n = self.n
         for name, shape in (("sensed", (n, 2)), ("slip", (n, 2)), ("force", (n, 2)), ("steer_angle", (n,))):
             _check(name, getattr(reading, name), shape)
-        loads = self.normal_force(reading.steer_angle, reading.force)
+        force = reading.force
+        if numbers is self._with_torque:
+            # What turns the wheel itself does not push the robot.
+            force = np.column_stack([ground_force(numbers, state, force[:, 0], dt), force[:, 1]])
+        loads = self.normal_force(reading.steer_angle, force)
         values = np.empty((1, n, 6))
         values[0, :, 0] = reading.sensed[:, 0]
         values[0, :, 1] = reading.sensed[:, 0] - reading.slip[:, 0]

@@ -1012,6 +1012,25 @@ def initial_state(n: int = 1) -> TerrainState:
     return TerrainState(numbers, np.zeros((n, GRID, _SUMS)), np.zeros((n, _HISTORY, _BLOCK)))
 
 
+def ground_force(numbers: FloatArray, state: TerrainState, force: FloatArray, dt: float) -> FloatArray:
+    """Return the forces of the ground along the headings (n,) [N] of torques over radius, (3.45) [Li2009].
+
+    The acceleration of the wheels is that of the filter behind the last reading: none before the first.
+
+    Args:
+        numbers: parameters of all wheels, stacked; of forces that are those of the ground already the inertia is 0.
+        state: after the reading before.
+        force: torques over radius (n,) [N].
+        dt: time between readings [s].
+    """
+    filtered = state.numbers[:, [_ROLLING, _ROLLING + 1]]
+    # So far apart are both stages of a speed that grows steadily.
+    delay = dt / np.expm1(POLE_PER_CUT_OFF * numbers[:, _CUT_OFF] * dt)
+    acceleration = (filtered[:, 0] - filtered[:, 1]) / delay
+    found: FloatArray = force - numbers[:, _INERTIA] * acceleration
+    return found
+
+
 def estimate_of(row: FloatArray) -> TerrainEstimate:
     """Return what one row of results (RESULTS,) says."""
     known = row[MU_P] > 0.0

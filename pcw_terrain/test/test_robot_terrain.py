@@ -97,6 +97,21 @@ def test_loads_carry_the_weight_and_follow_the_push():
     assert (pushed[:2] < still[:2]).all() and (pushed[2:] > still[2:]).all()  # forwards: the rear carries more
 
 
+def test_what_turns_the_wheels_themselves_does_not_shift_the_loads():
+    """Wheels that spin up without holding anything: the whole torque was taken for a push, and mu_p was off by a tenth."""
+    terrain, n, dt, acceleration = RobotTerrain(THESIS), THESIS.n, 0.002, 40.0
+    still = terrain.normal_force(np.zeros(n), np.zeros((n, 2)))
+    inertia = [c.wheel.inertia_axle + THESIS.armature[i, DRIVE, DRIVE] for i, c in enumerate(THESIS.casters)]
+    state, velocity, effort = terrain.initial_state(), np.zeros((n, 2)), np.zeros((n, 2))
+    effort[:, DRIVE] = np.array(inertia) * acceleration / THESIS.wheel_radius
+    pushed = terrain.normal_force(np.zeros(n), np.column_stack([effort[:, DRIVE] / THESIS.wheel_radius, np.zeros(n)]))
+    for k in range(100):
+        velocity[:, DRIVE] = acceleration * k * dt / THESIS.wheel_radius
+        state, found = terrain.step_with_twist(state, np.zeros((n, 2)), velocity, effort, np.zeros(3), dt)
+    assert np.abs(pushed - still).max() > 0.1 * still.mean()
+    np.testing.assert_allclose(found.normal_force, still, rtol=0.01)
+
+
 def test_a_robot_reading_that_is_not_finite_or_of_a_wrong_shape_is_refused():
     terrain, good = RobotTerrain(THESIS), np.zeros((4, 2))
     state = terrain.initial_state()
