@@ -1,6 +1,7 @@
 """Reported torques in other units or of the other sign, told by the motion that they make."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,11 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
+from pcw_sim_bridge.mismatch.findings import InputFinding
 from pcw_sim_bridge.mismatch.regression_problem import term_key
 from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.subject import Opened
 from pcw_sim_bridge.mismatch.torque_units import FRICTIONS, torque_units
 
 THESIS, TIDYBOT = load_robot("thesis"), load_robot("tidybot2")
@@ -55,6 +59,20 @@ def test_what_is_wrong_is_told_and_put_right_where_it_is_known(plain, reported, 
         np.testing.assert_allclose(states.effort, plain.joint_states.effort)
         # The commands of this recording are those at the joints.
         np.testing.assert_array_equal(commands.effort, plain.joint_commands.effort)
+
+
+@pytest.mark.parametrize(("factor", "used"), [(-1.0, True), (0.01, False)])
+def test_torques_in_unknown_units_are_not_used(plain, factor, used):
+    """A hundredth of the torques left "nothing missing", with masses that were 28 tolerances off."""
+    joints = plain.joint_states
+    reported = SimpleNamespace(**{field.name: getattr(plain, field.name) for field in dataclasses.fields(plain)})
+    reported.joint_states = dataclasses.replace(joints, effort=factor * joints.effort)
+    subject = RobotSubject(THESIS)
+    opened = [Opened(reported, InputFinding("run", "", 10.0, "fit", (), 0.0))]
+    [right] = subject.put_right(subject.problem(opened), opened)
+    assert np.isfinite(right.recording.joint_states.effort).all() == used
+    assert any("force" in channel.name for channel in subject.problem([right]).channels) == used
+    assert right.finding.warnings[-1].endswith("converted to torques at the joints" if used else "and are left out")
 
 
 def test_commands_in_the_units_of_the_reports_go_along(plain):

@@ -92,8 +92,7 @@ class RobotSubject:
         unmeasured = unmeasured_torques(self._seen_robot(), recording)
         if missing or unmeasured:
             # The force of one caster unknown, that of all together is.
-            joints = recording.joint_states
-            recording.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
+            recording = _without_torques(recording)
         self._check_sensors(path, recording)
         evened = EvenStamps().evenly_stamped(recording)
         late = late_stamps(recording, evened)
@@ -178,7 +177,7 @@ class RobotSubject:
         return problem
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
-        """Return recordings with torques at the joints; where they are in unknown units, as they are, with a warning.
+        """Return recordings with torques at the joints; where they are in unknown units, without them; with a warning.
 
         So they are, too, where torques alone tell that the wheels are off the ground, for a problem of another kind.
         """
@@ -190,10 +189,9 @@ class RobotSubject:
             return opened
         right = []
         for one in opened:
-            recording = one.recording
+            recording = _without_torques(one.recording)
             if found.is_known:
-                recording = copy.copy(recording)
-                recording.joint_states, recording.joint_commands = found.put_right(self._seen_robot(), recording)
+                recording.joint_states, recording.joint_commands = found.put_right(self._seen_robot(), one.recording)
             warnings = (*one.finding.warnings, found.warning)
             right.append(Opened(recording, dataclasses.replace(one.finding, warnings=warnings)))
         return right
@@ -345,6 +343,13 @@ class RobotSubject:
     def rollout_floor(self, windows: Windows, rng: np.random.Generator) -> FloatArray:
         """Return the squared errors that the noise of the sensors makes in it, (W, H, S)."""
         return rollout_floor(self.robot, windows, self._undescribed, rng)
+
+
+def _without_torques(recording: Recording) -> Recording:
+    """Return the recording as if no torque had been measured."""
+    left, joints = copy.copy(recording), recording.joint_states
+    left.joint_states = dataclasses.replace(joints, effort=np.full_like(joints.effort, np.nan))
+    return left
 
 
 def _missing_casters(robot: RobotDescription, recording: Recording) -> tuple[str, ...]:
