@@ -22,6 +22,7 @@ UNMEASURED_SHARE = 0.5
 FEW = 0.05
 # A joint whose position has changed by more has moved [rad].
 MOVED = 0.1
+COASTING = 5.0  # [s] for which a robot may roll without any torque
 
 
 def read_joint_series(
@@ -52,7 +53,7 @@ def read_joint_series(
     stamp = (stamp_ns - (stamp_ns[0] if t0_ns is None else t0_ns)) * 1e-9
     table.warn_of_gaps(stamp)
     if measured:
-        _leave_out_idle_fields(table, joints, values)
+        _leave_out_idle_fields(table, joints, values, stamp)
         _warn_of_missing_fields(table, joints, values)
         correct_units(stamp, names, robot, values[POSITION], values[VELOCITY], table.warn)
     else:
@@ -125,16 +126,17 @@ def _warn_of_missing_fields(table: MessageTable, joints: _JointTable, values: Fl
             table.warn("missing_field", f"no {name} of {which} was measured; it is NaN", count)
 
 
-def _leave_out_idle_fields(table: MessageTable, joints: _JointTable, values: FloatArray) -> None:
-    """Some drivers send zeros for what they do not measure; in place, on values (3, T, m).
+def _leave_out_idle_fields(table: MessageTable, joints: _JointTable, values: FloatArray, stamp: FloatArray) -> None:
+    """Some drivers send zeros for what they do not measure; in place, on values (3, T, m) at stamps (T,) [s].
 
-    A joint that moves has a velocity. It may have no torque; that none of several joints ever has any is no measurement.
+    A joint that moves has a velocity. It may have no torque, and a robot that coasts may have none for a while; that none of
+    several joints ever has any is no measurement.
     """
     there = np.flatnonzero(joints.ever_present)
     moving = there[np.ptp(values[POSITION][:, there], axis=0) > MOVED]
     still = moving[~values[VELOCITY][:, moving].any(axis=0)]
     _leave_out(table, joints, values, VELOCITY, still)
-    if len(moving) > 1 and not values[EFFORT][:, there].any():
+    if len(moving) > 1 and stamp[-1] - stamp[0] > COASTING and not values[EFFORT][:, there].any():
         _leave_out(table, joints, values, EFFORT, there)
 
 

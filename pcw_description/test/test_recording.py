@@ -850,11 +850,14 @@ def test_zeros_for_a_velocity_that_nobody_measures_are_left_out(robot: RobotDesc
     np.testing.assert_array_equal(recording.joint_states.velocity[:, :, DRIVE], spoilt.velocity[:, :, DRIVE])
 
 
-@pytest.mark.parametrize("measured", [False, True])
-def test_zeros_for_efforts_that_nobody_measures_are_left_out(measured: bool, robot: RobotDescription, tmp_path: Path) -> None:
-    """Hardware interfaces without torques send zeros; a joint alone may well have none, as one that is only dragged along."""
-    spoilt = drive(robot)
-    spoilt.effort[:, int(measured):] = 0.0
+@pytest.mark.parametrize(("joints", "seconds", "measured"), [(0, 12.0, False), (1, 12.0, True), (0, 4.0, True)])
+def test_zeros_for_efforts_that_nobody_measures_are_left_out(
+    joints: int, seconds: float, measured: bool, robot: RobotDescription, tmp_path: Path
+) -> None:
+    """Hardware interfaces without torques send zeros; a joint alone may have none, one that is dragged along; or a robot."""
+    whole = drive(robot)
+    spoilt = whole.keep(np.arange(round(seconds * RATE)))
+    spoilt.effort[:, joints:] = 0.0
     recording = Recording.open(spoilt.write(tmp_path / "bag"), robot)
     assert np.isnan(recording.joint_states.effort).all() != measured
     texts = [str(warning) for warning in recording.warnings if warning.code == "missing_field"]
