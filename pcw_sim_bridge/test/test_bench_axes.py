@@ -272,7 +272,7 @@ def with_signals(case: BenchCase, position: np.ndarray, force: np.ndarray) -> Ax
 
 
 def test_an_axis_that_stands_still_has_nothing_to_judge() -> None:
-    """Noise on a position that does not change is no motion, and a force of zero is no drive."""
+    """Noise on a position that does not change is no motion, and a force that is always the same is no drive's."""
     rng = np.random.default_rng(0)
     case = draw_bench_case(rng, kind="rotary")
     size = len(case.recordings[0].time)
@@ -280,5 +280,6 @@ def test_an_axis_that_stands_still_has_nothing_to_judge() -> None:
     for position in (np.ones(size), 1.0 + 1e-4 * rng.standard_normal(size)):
         builder = with_signals(case, position, force)
         assert not builder.build(builder.choose_smoothing()).valid.any()
-    with pytest.raises(MismatchError, match="the force is 0 throughout"):
-        with_signals(case, case.recordings[0].position, np.zeros(size))
+    for always in (0.0, 1.3):
+        with pytest.raises(MismatchError, match=f"the force is {always:.3g} throughout"):
+            with_signals(case, case.recordings[0].position, np.full(size, always))

@@ -173,8 +173,11 @@ class AxisProblemBuilder:
             MismatchError: no recording has a piece long enough, or one has no force.
         """
         for recording in recordings:
-            if not np.any(recording.force + recording.external_force):
-                raise MismatchError(f"{recording.path}: the force is 0 throughout; allowed: a drive that works")
+            acting = recording.force + recording.external_force
+            known = acting[np.isfinite(acting)]
+            if not len(known) or np.ptp(known) == 0.0:
+                always = f"{known[0]:.3g}" if len(known) else "NaN"
+                raise MismatchError(f"{recording.path}: the force is {always} throughout; allowed: a drive that works")
             rate = 1.0 / float(np.median(np.diff(recording.time)))
             if rate < LEAST_RATE:
                 raise MismatchError(
