@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pcw_control.excitation import make_excitation
-from pcw_description import load_robot
+from pcw_description import load_robot, ros_messages
 from pcw_description.recording import Recording
 from pcw_description.recording_files import RawMessage
 from pcw_sim_bridge.mismatch.departure_keeper import DepartureKeeper, KeepParameters
@@ -77,6 +77,23 @@ def test_a_healthy_robot_stays_near_one_and_a_fault_is_seen_where_it_is(friction
     # The torques feel it, and the slip that is foretold from them: not what the IMU and the tracker measure.
     departed = {state.name.partition("/")[0] for state in last.channels if state.level is not Level.OK}
     assert "chassis_force" in departed and departed <= {"chassis_force", "chassis_torque", "rolling_consistency"}
+
+
+def test_an_imu_without_accelerometer_is_watched_for_what_it_has(friction: list[RawMessage]) -> None:
+    """Zeros were learned from; since nobody measured them, the watch must not wait for accelerations for ever."""
+    sent = []
+    for message in friction:
+        if message.topic == "/imu/data":
+            imu = ros_messages.typestore().deserialize_cdr(message.cdr, message.type_name)
+            felt = ros_messages.imu(header_stamp(message.cdr), [0.0, 0.0, imu.angular_velocity.z], np.zeros(3))
+            message = message._replace(cdr=ros_messages.serialise(felt))
+        sent.append(message)
+    live = LiveChannels(THESIS, PARAMETERS)
+    last = [judgement for _, judgement, _ in judgements(live, iter(sent))][-1]
+    names = {state.name for state in last.channels} | set(last.silent)
+    assert live.tuning is not None
+    assert "gyro" in names and not any(name.startswith("accelerometer") for name in names)
+    assert last.level is not Level.OK
 
 
 @pytest.mark.nightly

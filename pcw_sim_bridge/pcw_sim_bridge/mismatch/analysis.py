@@ -358,6 +358,7 @@ def _rms(values: FloatArray, valid: np.ndarray) -> FloatArray:
 
 
 def _channels(explanation: Explanation) -> tuple[ChannelFinding, ...]:
+    """Findings on the channels of which anything could be judged."""
     problem = explanation.search.problem
     nominal = _rms(problem.nominal_residual, problem.valid)
     return tuple(
@@ -365,7 +366,7 @@ def _channels(explanation: Explanation) -> tuple[ChannelFinding, ...]:
             channel.name, channel.unit, float(nominal[c]), float(explanation.floor[c]), float(explanation.p_values[c]),
             bool(explanation.p_values[c] < FLAG_PROBABILITY),
         )
-        for c, channel in enumerate(problem.channels)
+        for c, channel in enumerate(problem.channels) if problem.valid[:, c].any()
     )
 
 

@@ -249,7 +249,9 @@ class LiveChannels:
         reader = RowReader(self.robot, builder.cutoff, stamps)
         window = reader.go_on(recording, builder, told)
         rate = float(np.mean([f.decimated_rate for f in builder.filters]))
-        self.tuning = Tuning.learn(digest(self.robot), builder.cutoff, window.layout, window.rows, rate)
+        layout = window.layout.without(builder.unmeasured)
+        rows, _ = layout.arranged(window.layout, window.rows)
+        self.tuning = Tuning.learn(digest(self.robot), builder.cutoff, layout, rows, rate)
         self._reader = reader
         self._moved.clear()
         self._ring = self._ring_for(LONGEST_WINDOW)

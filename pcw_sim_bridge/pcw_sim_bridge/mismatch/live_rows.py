@@ -7,7 +7,7 @@ channel's filter, are left to the window after. So what is judged lags behind by
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -101,6 +101,10 @@ class Layout:
             for number_to, number_from in numbers:
                 arranged.columns[:, to, number_to] = rows.columns[:, source, number_from]
         return arranged, tuple(name for name in self.channel_names if name not in layout.channel_names)
+
+    def without(self, names: Collection[str]) -> Layout:
+        """The same without channels of these names."""
+        return dataclasses.replace(self, channels=tuple(channel for channel in self.channels if channel.name not in names))
 
     @property
     def channel_names(self) -> tuple[str, ...]:

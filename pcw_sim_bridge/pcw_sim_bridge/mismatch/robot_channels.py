@@ -53,7 +53,16 @@ from .robot_nuisances import (
     varied_numbers,
 )
 from .robot_terms import robot_terms
-from .rolling_model import WRENCH, ChannelLayout, ModelNumbers, RollingState, at_place, rolling_state, twists
+from .rolling_model import (
+    INERTIAL,
+    WRENCH,
+    ChannelLayout,
+    ModelNumbers,
+    RollingState,
+    at_place,
+    rolling_state,
+    twists,
+)
 from .seeming_geometry import seeming_numbers
 from .signal_filter import SignalFilter, derivative
 from .sudden_slip import spinning, sudden_slip
@@ -128,6 +137,9 @@ class RobotProblemBuilder:
         if not motions:
             raise MismatchError(f"no contiguous piece of at least {SHORTEST_SEGMENT:g} s in the recordings")
         imu = any(np.isfinite(motion.imu).any() for motion in motions) and not lifted
+        # An IMU may have a gyro alone, or an accelerometer.
+        sensed = [any(np.isfinite(motion.imu[:, k]).any() for motion in motions) for k in range(len(INERTIAL))]
+        self.unmeasured = tuple(name for name, there in zip(INERTIAL, sensed, strict=True) if imu and not there)
         pose = any(np.isfinite(motion.tracked_twist).any() for motion in motions) and not lifted
         self.layout = ChannelLayout(robot.caster_names, balanced, imu, pose, len(robot.fixed_axle), lifted)
         # Numbers that effects in the description already change belong to the nominal model.

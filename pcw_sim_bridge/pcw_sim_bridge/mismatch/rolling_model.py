@@ -64,6 +64,7 @@ OF_NO_MOTION = frozenset((
 ))  # fmt: skip
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
+INERTIAL = ("gyro", "accelerometer/x", "accelerometer/y")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,8 +130,7 @@ class ChannelLayout:
                 name = f"rolling_consistency/{caster}_{direction}"
                 found.append(Channel(name, "m/s", (caster,), axis, information=share))
         if self.imu:
-            found.append(Channel("gyro", "rad/s", axis="imu"))
-            found += [Channel(f"accelerometer/{axis}", "m/s^2", axis="imu") for axis in "xy"]
+            found += [Channel(name, "rad/s" if name == "gyro" else "m/s^2", axis="imu") for name in INERTIAL]
         if self.pose:
             found += [Channel(f"pose/{axis}", "rad/s" if axis == "yaw" else "m/s") for axis in ("x", "y", "yaw")]
         return tuple(found)
