@@ -177,7 +177,7 @@ class RobotSubject:
         return problem
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
-        """Return recordings with torques at the joints; where they are in unknown units, without them; with a warning.
+        """Return recordings with torques at the joints; where they are in unknown units, without any; with a warning.
 
         So they are, too, where torques alone tell that the wheels are off the ground, for a problem of another kind.
         """
@@ -187,12 +187,14 @@ class RobotSubject:
         found = torque_units(self._seen_robot(), problem)
         if found is None:
             return opened
+        # One wheel that points elsewhere makes all torques look wrong.
+        left_out = not found.is_known and self.turned_steering(problem, opened) is None
         right = []
         for one in opened:
-            recording = _without_torques(one.recording)
+            recording = _without_torques(one.recording) if left_out else copy.copy(one.recording)
             if found.is_known:
                 recording.joint_states, recording.joint_commands = found.put_right(self._seen_robot(), one.recording)
-            warnings = (*one.finding.warnings, found.warning)
+            warnings = (*one.finding.warnings, f"{found.warning}, and are left out" if left_out else found.warning)
             right.append(Opened(recording, dataclasses.replace(one.finding, warnings=warnings)))
         return right
 

@@ -92,7 +92,7 @@ def torque_units(robot: RobotDescription, problem: RegressionProblem) -> TorqueU
     if not told:
         return None
     known = bool(np.all(np.isfinite(factors)))
-    made = "converted to torques at the joints" if known else "they have to be torques at the joints [N m], and are left out"
+    made = "converted to torques at the joints" if known else "they have to be torques at the joints [N m]"
     return TorqueUnits(factors, f"joint_states: of the reported torques {' and '.join(told)}; {made}")
 
 
