@@ -177,9 +177,9 @@ class RobotSubject:
         return problem
 
     def put_right(self, problem: RegressionProblem, opened: Sequence[Opened]) -> Sequence[Opened]:
-        """Return recordings with torques at the joints; where they are in unknown units, without any; with a warning.
+        """Return recordings with torques at the joints, or without any where nobody knows their units and no wheel is turned.
 
-        So they are, too, where torques alone tell that the wheels are off the ground, for a problem of another kind.
+        They stay as they are, for a problem of another kind, where torques alone tell that the wheels are off the ground.
         """
         if not self._off_ground and wheels_turn_alone(problem):
             self._lifted, self._cutoff = (Path(opened[0].finding.path), True), None
