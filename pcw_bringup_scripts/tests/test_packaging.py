@@ -203,6 +203,16 @@ def test_what_a_page_names_is_there(page):
 
 
 @pytest.mark.parametrize("package", PACKAGES)
+def test_every_topic_of_a_node_stands_in_the_table_of_topics(package):
+    table = (REPOSITORY / "README.md").read_text(encoding="utf-8").partition("\n## Topics\n")[2].partition("\n## ")[0]
+    listed = set(re.findall(r"`([\w/]+)`", "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("|"))))
+    sources = (REPOSITORY / package / package / "nodes").glob("*.py")
+    text = "".join(path.read_text(encoding="utf-8") for path in sources)
+    topics = set(re.findall(r"create_(?:publisher|subscription)\(\w+, \"([\w/]+)\"", text))
+    assert topics <= listed, sorted(topics - listed)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
 def test_installation_holds_every_file_of_the_sources(package):
     """A folder without `__init__.py`, or a template that package_data does not name, is missing from an installation."""
     source = REPOSITORY / package / package
