@@ -32,6 +32,7 @@ from pcw_sim_bridge.mismatch.rolling_model import (
     slips,
     wheel_motion,
 )
+from pcw_sim_bridge.mismatch.slow_drifts import beside, drifting_columns
 from pcw_sim_bridge.mismatch.whitened_regression import Instance
 from pcw_sim_bridge.simulated_run import record_run
 from pcw_sim_bridge.stamping import HEALTHY
@@ -422,6 +423,20 @@ def test_scales_of_an_imu_are_numbers_too(healthy: Recording) -> None:
         assert numbers[name].deviation == THESIS.tolerance("imu.scale").value
         effect, number = term.columns(term.shapes[0])[:, :, k], numbers[name].column
         assert np.linalg.norm(effect - number) < 0.05 * np.linalg.norm(effect)
+
+
+def test_an_imu_elsewhere_is_no_chassis_that_leans(healthy: Recording) -> None:
+    """One 17 cm ahead of its place was silent with 40 nats: smaller than what a chassis leans, and nothing like it."""
+    problem = RobotProblemBuilder(THESIS, [healthy]).build()
+    terms = {term.effect: term for term in problem.terms if term.target == ("imu",)}
+    assert [name for name, term in terms.items() if term.unlike_errors] == ["imu_lever_arm"]
+    drifting = drifting_columns(problem)[problem.valid]
+    left = {}
+    for name, term in terms.items():
+        columns = term.columns(term.shapes[0])
+        seen = [column[problem.valid] for column in np.moveaxis(columns, 2, 0)]
+        left[name] = [beside(drifting, column) / float(column @ column) for column in seen]
+    assert max(left["imu_bias"]) < 1e-9 and min(left["imu_lever_arm"]) > 0.5
 
 
 def test_slips_lag_as_torques_do(healthy: Recording) -> None:

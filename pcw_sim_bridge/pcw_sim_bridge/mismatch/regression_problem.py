@@ -170,8 +170,8 @@ class Term:
         at_joints: it adds torques to joints, in proportion to its parameters.
         turning: a phase or a direction shapes it, of which two a quarter turn apart make all others.
         noisy: its columns hold some of the noise that the residual holds, by the control that acts on that noise.
-        unlike_errors: it turns with the angle of its own joint, or changes sides with the torque of its gear, as nothing does
-            that the model misjudges.
+        unlike_errors: it turns with the angle of its own joint, changes sides with the torque of its gear, or goes with the
+            square and the change of the rate of turning, as nothing does that the model misjudges.
         once: it is at work at one time, or one place, only: judged there, and no other part of a recording can foretell it.
         recording: the only one in which it is at work; None: it is in all, at the same time.
         law: the very law outside the library that it is, of which there may be several of the same arguments; None of effects.

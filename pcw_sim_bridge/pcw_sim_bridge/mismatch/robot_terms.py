@@ -324,7 +324,11 @@ class _TermMaker:
             turning=turning is not None,
             # Where no torque was measured, tyres slip under the forces that the motion asks for, and its noise is in these.
             noisy=isinstance(effect, TransmissionEffect) or (effect.name.startswith("tyre_") and not self.layout.balanced),
-            unlike_errors="play" in names or (isinstance(effect, EncoderEffect) and turning is not None),
+            unlike_errors=(
+                "play" in names
+                or (isinstance(effect, EncoderEffect) and turning is not None)
+                or (isinstance(effect, DescriptionEffect) and effect.target_kind == "imu")
+            ),
             once=look in ("windows", "patches"),
             recording=recording,
             headed=leaning if isinstance(effect, ImuEffect) else None,

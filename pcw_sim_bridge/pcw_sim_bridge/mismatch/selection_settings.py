@@ -21,7 +21,7 @@ class SelectionSettings:
         least_peculiar: nats that a term smaller than what the model misjudges must have beside the model's own errors. What
             healthy robots in other simulations than the model were given wrongly stayed below half of it.
         least_peculiar_unlike: the same of what has a shape that errors of the model have not: torques at joints, errors of
-            reading that turn with the joint, play. There healthy robots reached half of it at most.
+            reading that turn with the joint, play, an IMU elsewhere. There healthy robots reached half of it at most.
         blocks: of the cross-validation.
         first_repeats: instances of a repeatable term in the first over-complete set; more would eat red noise line by line.
     """
