@@ -149,13 +149,30 @@ def test_nan_in_lets_go_and_never_comes_out(ros):
     robot.run(robot.drives)
     robot.bad_velocity = True
     robot.run(robot.let_go)
-    ros.wait_for(lambda: "joint_velocity" in warnings_of(diagnostics))
+    ros.wait_for(lambda: "velocity of front_right_steer is NaN" in warnings_of(diagnostics))
     robot.bad_velocity = False
     robot.run(robot.drives)
     robot.target = (math.nan, 0.0, 0.0)
     robot.run(robot.let_go)
     ros.wait_for(lambda: "refused: cmd_vel" in warnings_of(diagnostics))
     assert all(np.isfinite(command.effort).all() for command in robot.commands)
+
+
+def test_joints_of_an_arm_on_the_same_topic_do_not_let_go(ros):
+    """Drivers share joint_states: each message of an arm was one without the robot's joints, and every other torque zero."""
+    ros.start(CONTROLLER)
+    robot = Robot(ros)
+    robot.run(robot.drives)
+    arm = JointState(name=["arm_1", "arm_2"], position=[0.1, 0.2], velocity=[0.0, 0.0])
+    count = len(robot.commands)
+
+    def with_arm():
+        arm.header.stamp = ns_to_stamp(robot.time_ns + PERIOD_NS // 2)
+        robot.states.publish(arm)
+        return len(robot.commands) > count + 100
+
+    robot.run(with_arm)
+    assert all(any(command.effort) for command in robot.commands[count:])
 
 
 def test_unusable_positions_do_not_make_it_race(ros):

@@ -117,7 +117,7 @@ def test_odometry_keeps_its_pose_over_a_gap_and_unusable_joints(ros):
 
     good, robot.position[2, 0] = robot.position.copy(), math.nan
     robot.publish(1)
-    ros.wait_for(lambda: "NaN" in messages_of(diagnostics))
+    ros.wait_for(lambda: "position of rear_left_drive is NaN" in messages_of(diagnostics))
     robot.position = good
     count = len(odom)
     robot.run(lambda: len(odom) > count + 5)
@@ -135,6 +135,36 @@ def test_odometry_keeps_its_pose_over_a_gap_and_unusable_joints(ros):
     count = len(odom)
     robot.run(lambda: len(odom) > count + 5)
     assert max(m.twist.twist.linear.x for m in odom[count:]) < 0.6
+
+
+def test_headings_that_are_wrapped_and_joints_of_others_do_not_move_odom(ros):
+    """Steerings with absolute encoders jump by a turn, and drivers of arms share the topic."""
+    ros.start("pcw_estimation.nodes.odometry")
+    odom, diagnostics, robot = ros.listen(Odometry, "odom"), ros.listen(DiagnosticArray, "/diagnostics"), RollingRobot(ros)
+    arm, publish = JointState(name=["arm_1"], position=[0.1]), robot.publisher.publish
+
+    def wrapped(message):
+        for i in range(1, 8, 2):
+            message.position[i] -= math.tau * ((robot.time_ns // PERIOD_NS // 10 + i // 2) % 2)
+        publish(message)
+        arm.header.stamp = ns_to_stamp(robot.time_ns + PERIOD_NS // 4)
+        publish(arm)
+
+    robot.publisher.publish = wrapped
+    robot.run(lambda: odom and stamp_to_ns(odom[-1].header.stamp) > 2e9)
+    assert max(abs(m.twist.twist.linear.x - TWIST[0]) for m in odom) < 1e-3
+    assert {s.message for d in diagnostics for s in d.status} <= {"integrating", "no joint_states since the last report"}
+
+
+def test_stamps_that_stand_still_are_said(ros):
+    ros.start("pcw_estimation.nodes.odometry")
+    diagnostics, robot = ros.listen(DiagnosticArray, "/diagnostics"), RollingRobot(ros)
+
+    def publish():
+        robot.time_ns = -PERIOD_NS
+        robot.publish(1)
+
+    ros.wait_for(lambda: "all joint_states have the stamp 0.000000000 s" in messages_of(diagnostics), while_doing=publish)
 
 
 def test_silence_is_reported(ros):

@@ -103,8 +103,21 @@ def test_a_missing_joint_is_said_and_not_made_up(ros):
     slip, diagnostics = ros.listen(JointState, "slip/encoder"), ros.listen(DiagnosticArray, "/diagnostics")
     robot = Robot(ros, with_imu=False)
     robot.order = list(range(7))
-    robot.run(lambda: "joint_position" in said(diagnostics))
+    robot.run(lambda: "lacks rear_right_steer" in said(diagnostics))
     assert not slip
+
+
+def test_slip_of_before_does_not_hide_that_nothing_comes_any_more(ros):
+    """The last flags were reported for as long as joint_states stayed away."""
+    ros.start("pcw_estimation.nodes.encoder_slip")
+    diagnostics, robot = ros.listen(DiagnosticArray, "/diagnostics"), Robot(ros, with_imu=False)
+
+    def spins(position, velocity):
+        velocity[1, 0] += 5.0
+
+    robot.falsify, robot.speed = spins, 0.5
+    robot.run(lambda: "slip since" in said(diagnostics))
+    ros.wait_for(lambda: statuses(diagnostics)["encoder_slip: slip"].message == "no joint_states since the last report")
 
 
 def test_that_nothing_slips_is_said_only_by_who_has_an_imu(ros):
@@ -169,7 +182,7 @@ def test_bad_stamps_and_numbers_are_counted_and_nothing_of_them_leaves(ros):
         velocity[2, 1] = math.nan
 
     robot.falsify = not_a_number
-    robot.run(lambda: "joint_velocity" in said(diagnostics))
+    robot.run(lambda: "velocity of rear_left_steer is NaN" in said(diagnostics))
     robot.falsify, robot.gyro = lambda position, velocity: None, math.inf
     robot.run(lambda: "gyro, acceleration = inf" in said(diagnostics))
     robot.gyro = 0.0

@@ -147,7 +147,7 @@ def test_nan_and_missing_fields_are_left_out_and_told(ros):
 
         robot.change = with_nan
         robot.publish(2)
-        ros.wait_for(lambda: f"joint {field}" in said(diagnostics))  # noqa: B023
+        ros.wait_for(lambda: f"{field} of front_right_steer is NaN" in said(diagnostics))  # noqa: B023
         robot.change = lambda message: message
         count = len(slip)
         robot.run(lambda: len(slip) > count + 5)  # noqa: B023

@@ -154,7 +154,7 @@ def test_nan_gaps_and_missing_joints_are_told_and_nothing_of_it_is_sent(ros):
         return message
 
     robot.change = with_nan
-    robot.run(lambda: "lacks front_left_drive" in said(diagnostics))
+    robot.run(lambda: "velocity of front_left_drive is NaN" in said(diagnostics))
     assert int(values_of(diagnostics)["unusable_joint_states"]) > 0
     robot.change = lambda message: message
     robot.publish()

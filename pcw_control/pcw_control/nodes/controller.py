@@ -20,16 +20,14 @@ from sensor_msgs.msg import JointState
 from pcw_description import PcwError, load_robot, odometry
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Problems, Status
 from pcw_description.nodes.lifecycle import RobustLifecycleNode
+from pcw_description.nodes.measured_joints import MeasuredJoints
 from pcw_description.nodes.node_tools import (
     COMMAND,
     COMMAND_SOURCE,
     SENSOR,
-    Silence,
-    StampWatch,
     all_declared,
     declare,
     fill_joint_state,
-    joint_state_arrays,
     run_node,
     stamp_to_ns,
     wait_until_heard,
@@ -86,7 +84,6 @@ class ControllerNode(RobustLifecycleNode):
         declare_controller_parameters(self, robot)
         self._declare_more()
         all_declared(self)
-        self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
         self._message = JointState(name=list(robot.joint_names))
         self._faults = self._timeouts = self._refused = self._switches = 0
         self._problems = Problems(self)
@@ -148,8 +145,8 @@ class ControllerNode(RobustLifecycleNode):
 
     def _forget(self) -> None:
         """Start afresh: nothing commanded, nothing measured, nothing latched."""
-        self._watch = StampWatch(LONGEST_GAP)
-        self._silence = Silence(self._watch)
+        self._joints = MeasuredJoints(self.robot, ["position", "velocity"], self._problems, LONGEST_GAP)
+        self._watch = self._joints.watch
         self._odometry = odometry.initial_state()
         self._state = self._controller.initial_state()
         self._passed = self._gate.initial_state()
@@ -312,7 +309,7 @@ class ControllerNode(RobustLifecycleNode):
     # --- Control ----------------------------------------------------------------------------------------
 
     def _on_joint_states(self, message: JointState) -> None:
-        if not self._active:
+        if not self._active or not self._joints.are_in(message):
             return
         self._heard = time.monotonic()
         self._message.header.stamp = message.header.stamp
@@ -336,17 +333,17 @@ class ControllerNode(RobustLifecycleNode):
             self._send({"exception"})
 
     def _control(self, message: JointState, dt: float | None) -> None:
-        position, measured_velocity, effort = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
-        position, velocity = self._seen(position, measured_velocity, effort, dt)
-        if dt is None:
-            # Before the first dt there is no odometry; after a gap or a jump the pose is kept and the motion between unknown.
-            self._odometry = odometry.initial_state(self._odometry.pose)
         try:
-            self._odometry, moved = odometry.update(self.robot, ODOMETRY, self._odometry, position, dt or 1.0)
+            position, measured_velocity, effort = self._joints.read(message)
         except PcwError:
             # The motion since the last usable position is divided by the time since then, or the robot would seem fast.
             self._watch.take_back()
             raise
+        position, velocity = self._seen(position, measured_velocity, effort, dt)
+        if dt is None:
+            # Before the first dt there is no odometry; after a gap or a jump the pose is kept and the motion between unknown.
+            self._odometry = odometry.initial_state(self._odometry.pose)
+        self._odometry, moved = odometry.update(self.robot, ODOMETRY, self._odometry, position, dt or 1.0)
         hazards: set[str] = set()
         reference = self._reference(hazards)
         if dt is None:
@@ -392,15 +389,15 @@ class ControllerNode(RobustLifecycleNode):
         self._problems.add(f"refused: {what}")
 
     def _status(self) -> Status:
-        problems = self._problems.take()
+        silence, problems = self._joints.silence(), self._problems.take()
         if not self._active:
             level, message = OK, "not active"
         elif self._passed.latched:
             level, message = ERROR, f"latched: {self._fault}"
         elif problems:
             level, message = WARN, problems
-        elif self._silence.since_last_report():
-            level, message = WARN, "no joint_states since the last report; the torque is zero"
+        elif silence:
+            level, message = WARN, f"{silence}; the torque is zero"
         else:
             following = "a trajectory" if self._trajectory is not None else "cmd_vel" if self._driving else "nothing"
             level, message = OK, f"following {following}"

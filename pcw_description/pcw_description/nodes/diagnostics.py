@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -21,26 +22,34 @@ class Status:
     values: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
 
+# A number on its own: no part of a name, such as the 1 of wheel_1.
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)(?!\w)", re.IGNORECASE)
+
+
 class Problems:
-    """What went wrong since the last report: logged once, reported once, however often it happens."""
+    """What went wrong since the last report: logged once, reported once, however often it happens.
+
+    Texts that differ in nothing but their numbers are one problem, or a hundred measurements a second would be news each.
+    """
 
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
-        self._current: dict[str, None] = {}  # a set that keeps its order
-        self._reported: dict[str, None] = {}
+        self._current: dict[str, str] = {}  # the newest text by what it says but for its numbers
+        self._reported: dict[str, str] = {}
 
     def add(self, text: str) -> bool:
         """Note a problem; returns whether it is news."""
-        news = text not in self._current and text not in self._reported
+        kind = _NUMBER.sub("#", text)
+        news = kind not in self._current and kind not in self._reported
         if news:
             self._logger.warning(text)
-        self._current[text] = None
+        self._current[kind] = text
         return news
 
     def take(self) -> str:
         """Return all problems since the last call as one line, "" when there were none."""
         self._reported, self._current = self._current, {}
-        return "; ".join(self._reported)
+        return "; ".join(self._reported.values())
 
 
 class Diagnostics:

@@ -246,7 +246,7 @@ class StampWatch:
         self.count = 0
         self.repeated = False
         self.last_gap = 0.0  # [s]; the gap that the last stamp ended, 0 where it ended none
-        self._last_ns: int | None = None
+        self.last_ns: int | None = None  # that the next dt is measured from [ns]
         self._before_ns: int | None = None
 
     def update(self, stamp: Time) -> float | None:
@@ -256,8 +256,8 @@ class StampWatch:
         `longest_gap` [s]; the next dt is measured from this stamp.
         """
         now_ns = stamp_to_ns(stamp)
-        self._before_ns = last_ns = self._last_ns
-        self._last_ns = now_ns
+        self._before_ns = last_ns = self.last_ns
+        self.last_ns = now_ns
         self.count += 1
         self.repeated, self.last_gap = now_ns == last_ns, 0.0
         if last_ns is None:
@@ -276,7 +276,7 @@ class StampWatch:
 
     def take_back(self) -> None:
         """Say that the message of the last stamp was of no use: the next dt is measured from the stamp before."""
-        self._last_ns = self._before_ns
+        self.last_ns = self._before_ns
 
 
 class Silence:

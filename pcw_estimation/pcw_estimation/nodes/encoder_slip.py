@@ -12,12 +12,11 @@ from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import ERROR, OK, Diagnostics, Problems, Status
+from pcw_description.nodes.measured_joints import MeasuredJoints
 from pcw_description.nodes.node_tools import (
     COMMAND,
     SENSOR_STREAM,
     Decimator,
-    Silence,
-    StampWatch,
     all_declared,
     declare,
     joint_state_arrays,
@@ -63,17 +62,17 @@ class EncoderSlipNode(Node):
         self._faults = FaultIsolation(self.robot, self._noise) if isolates and self._method != "projection" else None
         self._warm_up()
         self._state = self._detector.initial_state()
-        self._watch = StampWatch()
-        self._silence = Silence(self._watch)
-        self._decimator = Decimator(rate)
         self._unusable, self._problems = 0, Problems(self)
+        self._joints = MeasuredJoints(self.robot, ["position", "velocity"], self._problems)
+        self._watch = self._joints.watch
+        self._decimator = Decimator(rate)
         self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
         self._commanded: np.ndarray | None = None
         self._topic = SlipTopic(self, "slip/encoder", self.robot)
         self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR_STREAM)
         if self._faults is not None:
             self.create_subscription(JointState, "joint_commands", self._on_joint_commands, COMMAND)
-        self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="slip", parts=self._joints)
+        self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="slip", parts=self._faulty_joints)
 
     def _adopt_parameters(self) -> None:
         def number(name: str) -> float:
@@ -101,13 +100,15 @@ class EncoderSlipNode(Node):
         self._commanded = effort
 
     def _on_joint_states(self, message: JointState) -> None:
+        if not self._joints.are_in(message):
+            return
         dt = self._watch.update(message.header.stamp)
         if self._watch.repeated:
             return
-        position, velocity, effort = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
         if dt is None:
             self._state = self._detector.initial_state()
         try:
+            position, velocity, effort = self._joints.read(message)
             self._state, finding = self._detector.step(self._state, position, velocity, dt or 0.0)
         except PcwError as error:
             self._watch.take_back()
@@ -125,11 +126,11 @@ class EncoderSlipNode(Node):
             self._topic.publish(message.header.stamp, finding)
 
     def _status(self) -> Status:
-        silent = "joint_states" if self._silence.since_last_report() else ""
+        silent = self._joints.silence()
         values = stamp_values(self._watch, self._unusable) | {"method": self._method}
         return self._topic.status(values, self._problems.take(), silent, encoders_alone=True)
 
-    def _joints(self) -> Mapping[str, Status]:
+    def _faulty_joints(self) -> Mapping[str, Status]:
         """One status for each joint at fault; for all together where none is."""
         if self._faults is None:
             return {}

@@ -47,7 +47,8 @@ class ImuSlipNode(Node):
         if self._motion is not None:
             values |= {"imu_in_use": self._motion.inertial, "gyro_bias": self._motion.gyro_bias}
         alone = self._motion is None or not self._motion.inertial
-        status = self._topic.status(values, self._stream.problems(), self._stream.silent(), encoders_alone=alone)
+        silent = self._stream.silent()
+        status = self._topic.status(values, self._stream.problems(), silent, encoders_alone=alone)
         if self._all_slip:
             status = Status(WARN, f"all wheels slip; {status.message}", status.values)
         self._all_slip = False

@@ -11,13 +11,13 @@ from sensor_msgs.msg import Imu, JointState
 
 from pcw_description import PcwError, RobotDescription
 from pcw_description.nodes.diagnostics import Problems
+from pcw_description.nodes.measured_joints import MeasuredJoints
 from pcw_description.nodes.node_tools import (
     SENSOR_STREAM,
     Silence,
     StampWatch,
     all_declared,
     declare,
-    joint_state_arrays,
     stamp_to_ns,
 )
 
@@ -69,11 +69,11 @@ class ImuStream:
         )
         self._robot, self._on_motion = robot, on_motion
         self._timeout_ns, self._offset_ns = int(timeout * 1e9), int(offset * 1e9)
-        self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
-        self.joints, self.imu = StampWatch(longest_gap), StampWatch(longest_gap)
-        self._joints_silence, self._imu_silence = Silence(self.joints), Silence(self.imu)
-        self._unusable, self._unusable_imu, self._late = 0, 0, 0
         self._problems = Problems(node)
+        self._measured_joints = MeasuredJoints(robot, ["position", "velocity"], self._problems, longest_gap)
+        self.joints, self.imu = self._measured_joints.watch, StampWatch(longest_gap)
+        self._imu_silence = Silence(self.imu)
+        self._unusable, self._unusable_imu, self._late = 0, 0, 0
         self._warm_up()
         self._state = self.filter.initial_state()
         self._event_ns: int | None = None  # up to when the state is carried on
@@ -110,11 +110,12 @@ class ImuStream:
         self._event_ns = max(now_ns, self._event_ns)
 
     def _on_joint_states(self, message: JointState) -> None:
+        if not self._measured_joints.are_in(message):
+            return
         dt = self.joints.update(message.header.stamp)
         if self.joints.repeated:
             return
         now_ns = stamp_to_ns(message.header.stamp)
-        position, velocity, _ = joint_state_arrays(message, self._joint_index, (self._robot.n, 2))
         event_ns = now_ns if self._event_ns is None else self._event_ns
         state, ahead = self._state, 0.0
         if dt is None:
@@ -127,6 +128,7 @@ class ImuStream:
             self._problems.add(f"joint_states lies {(event_ns - now_ns) * 1e-9:.3g} s before imu/data")
         ahead = max(now_ns - event_ns, 0) * 1e-9
         try:
+            position, velocity, _ = self._measured_joints.read(message)
             self._state, motion = self.filter.correct(state, position, velocity, dt or 0.0, ahead)
         except PcwError as error:
             self.joints.take_back()
@@ -137,12 +139,11 @@ class ImuStream:
         self._on_motion(message.header.stamp, dt, motion)
 
     def silent(self) -> str:
-        """Return which topic went silent since the last call; "" for none."""
-        imu_silent, joints_silent = self._imu_silence.since_last_report(), self._joints_silence.since_last_report()
-        if joints_silent:
-            return "joint_states"
+        """Return which topic went silent since the last call, in words; "" for none."""
+        imu_silent, joints_silent = self._imu_silence.since_last_report(), self._measured_joints.silence()
         # A robot that has none, by its file, need not be told so every second.
-        return "imu/data" if imu_silent and self._robot.sensors.imu is not None else ""
+        without_imu = imu_silent and self._robot.sensors.imu is not None
+        return joints_silent or ("no imu/data since the last report" if without_imu else "")
 
     def problems(self) -> str:
         """Return what went wrong since the last call."""

@@ -13,15 +13,13 @@ from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot, odometry
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
+from pcw_description.nodes.measured_joints import MeasuredJoints
 from pcw_description.nodes.node_tools import (
     SENSOR_SOURCE,
     SENSOR_STREAM,
     Decimator,
-    Silence,
-    StampWatch,
     all_declared,
     declare,
-    joint_state_arrays,
     run_node,
 )
 
@@ -61,12 +59,11 @@ class OdometryNode(Node):
         all_declared(self)
         self._parameters_of_odometry = odometry.OdometryParameters(method, memory)
         self._state = odometry.initial_state()
-        self._watch, self._twist = StampWatch(longest_gap), np.zeros(3)
-        self._silence = Silence(self._watch)
+        self._unusable, self._problems = 0, Problems(self)
+        self._joints, self._twist = MeasuredJoints(self.robot, ["position"], self._problems, longest_gap), np.zeros(3)
+        self._watch = self._joints.watch
         self._decimator = Decimator(rate)
         self._clear_mean()
-        self._unusable, self._problems = 0, Problems(self)
-        self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
         self._warm_up()
         self._odom = self.create_publisher(Odometry, "odom", SENSOR_SOURCE)
         self._tf = self.create_publisher(TFMessage, "/tf", 100) if publish_tf and TFMessage is not None else None
@@ -83,7 +80,8 @@ class OdometryNode(Node):
         self._duration, self._moved, self._moved_covariance = 0.0, np.zeros(3), np.zeros((3, 3))
 
     def _on_joint_states(self, message: JointState) -> None:
-        position, _, _ = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
+        if not self._joints.are_in(message):
+            return
         dt = self._watch.update(message.header.stamp)
         if self._watch.repeated:
             return
@@ -92,6 +90,7 @@ class OdometryNode(Node):
             self._state = odometry.interrupted(self._state, self._twist * self._watch.last_gap)
             self._clear_mean()
         try:
+            position, _, _ = self._joints.read(message)
             self._state, output = odometry.update(
                 self.robot, self._parameters_of_odometry, self._state, position, dt if dt is not None else 1.0
             )
@@ -128,10 +127,8 @@ class OdometryNode(Node):
             self._tf.publish(TFMessage(transforms=[transform]))
 
     def _status(self) -> Status:
-        problems = self._problems.take()
-        level, text = (WARN, problems) if problems else (OK, "integrating")
-        if self._silence.since_last_report():
-            level, text = WARN, "no joint_states since the last report"
+        problem = self._joints.silence() or self._problems.take()
+        level, text = (WARN, problem) if problem else (OK, "integrating")
         return Status(
             level, text,
             {

@@ -83,13 +83,13 @@ class SlipFusionNode(Node):
     def _status(self) -> Status:
         values = self._stream.values()
         values |= {"measurements_with_slip": self._left_out, "measurements_by_imu_alone": self._coasted}
-        problems, silent, motion = self._stream.problems(), self._stream.silent(), self._motion
+        silent, problems, motion = self._stream.silent(), self._stream.problems(), self._motion
         if motion is not None:
             values |= {"imu_in_use": motion.inertial, "gyro_bias": motion.gyro_bias}
         if problems:
             return Status(WARN, problems, values)
         if silent:
-            return Status(WARN, f"no {silent} since the last report", values)
+            return Status(WARN, silent, values)
         if motion is not None and motion.finding.verdict == Verdict.CANNOT_KNOW:
             return Status(WARN, "no wheel is known to roll, and there is no IMU to go by", values)
         if motion is not None and not motion.told:

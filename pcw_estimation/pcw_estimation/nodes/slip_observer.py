@@ -10,20 +10,17 @@ from sensor_msgs.msg import JointState
 
 from pcw_description import PcwError, load_robot
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
+from pcw_description.nodes.measured_joints import MeasuredJoints
 from pcw_description.nodes.node_tools import (
     SENSOR_SOURCE,
     SENSOR_STREAM,
     Decimator,
-    Silence,
-    StampWatch,
     all_declared,
     declare,
     fill_joint_state,
-    joint_state_arrays,
     run_node,
 )
 
-from ..errors import EstimationError
 from ..motor_current_slip import RobotCurrentDetector
 from ..robot_sliding_mode_observer import RobotSlidingModeObserver
 from ..sliding_mode_observer import MEASURED, SlidingModeParameters
@@ -65,11 +62,12 @@ class SlipObserverNode(Node):
         self._warm_up()
         self._state = self._observer.initial_state()
         self._estimate: SlipEstimate | None = None
-        self._watch = StampWatch(longest_gap)
-        self._silence = Silence(self._watch)
-        self._decimator = Decimator(rate)
+        by_angle = (method, measured) == ("sliding_mode", "angle")
+        needed = ["position", "effort"] if by_angle else ["position", "velocity", "effort"]
         self._unusable, self._problems = 0, Problems(self)
-        self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
+        self._joints = MeasuredJoints(self.robot, needed, self._problems, longest_gap)
+        self._watch = self._joints.watch
+        self._decimator = Decimator(rate)
         self._names = [f"{caster}_{direction}" for caster in self.robot.caster_names for direction in _DIRECTIONS]
         self._message = JointState(name=self._names)
         self._slip = self.create_publisher(JointState, "slip/observer", SENSOR_SOURCE)
@@ -84,14 +82,15 @@ class SlipObserverNode(Node):
             state, _ = self._observer.step(state, JointMeasurement(at_rest, at_rest, at_rest), 1e-3)
 
     def _on_joint_states(self, message: JointState) -> None:
+        if not self._joints.are_in(message):
+            return
         dt = self._watch.update(message.header.stamp)
         if self._watch.repeated:
             return
         if dt is None:
             self._state, self._estimate = self._observer.initial_state(), None
-        position, velocity, effort = joint_state_arrays(message, self._joint_index, (self.robot.n, 2))
         try:
-            self._check_names(message)
+            position, velocity, effort = self._joints.read(message)
             # The first reading has nothing before it, and its dt means nothing.
             self._state, estimate = self._observer.step(self._state, JointMeasurement(position, velocity, effort), dt or 1e-3)
         except PcwError as error:
@@ -104,13 +103,6 @@ class SlipObserverNode(Node):
             self._problems.add("forces and accelerations contradict each other; does the robot file match the robot?")
         if dt is not None and self._decimator.due(dt):
             self._publish(message, estimate)
-
-    def _check_names(self, message: JointState) -> None:
-        missing = self._joint_index.keys() - set(message.name)
-        if missing:
-            raise EstimationError(
-                f"joint_states lacks {', '.join(sorted(missing))}; allowed: all joints of {self.robot.name}, in any order"
-            )
 
     def _contradicted(self) -> bool:
         return isinstance(self._observer, RobotSlidingModeObserver) and self._observer.contradicted(self._state)
@@ -131,7 +123,7 @@ class SlipObserverNode(Node):
     def _status(self) -> Status:
         values: dict[str, object] = {"gaps": self._watch.gaps, "repeated_stamps": self._watch.repeats}
         values |= {"backward_jumps": self._watch.backward_jumps, "unusable_joint_states": self._unusable}
-        level, text, problems = OK, "observing", self._problems.take()
+        level, text, problems = OK, "observing", self._joints.silence() or self._problems.take()
         estimate = self._estimate
         if estimate is not None:
             values |= {"velocity_bound": estimate.velocity_bound, "velocity_valid": bool(estimate.velocity_valid.all())}
@@ -141,8 +133,6 @@ class SlipObserverNode(Node):
                 values |= {f"trust_{name}": float(t) for name, t in zip(self.robot.caster_names, trust, strict=True)}
         if problems:
             level, text = WARN, problems
-        elif self._silence.since_last_report():
-            level, text = WARN, "no joint_states since the last report"
         elif estimate is None or not estimate.velocity_valid.any():
             level, text = WARN, "no velocity is vouched for"
         return Status(level, text, values)

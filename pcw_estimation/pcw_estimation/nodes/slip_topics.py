@@ -65,27 +65,23 @@ class SlipTopic:
         Args:
             values: numbers to report as well.
             problems: what else went wrong, in words.
-            silent: which topic went silent; "" for none.
+            silent: which topic went silent, in words; "" for none.
             encoders_alone: no other sensor was asked, so that slip of all wheels alike cannot be excluded.
         """
-        flagged = [name for name, is_flagged in zip(self.names, self._ever.ravel()) if is_flagged]
-        finding, unknown = self._finding, self._unknown
+        finding, found, self._finding = self._finding, "", None  # what was found before the last report is no news
         if finding is not None:
+            flagged = ", ".join(name for name, is_flagged in zip(self.names, self._ever.ravel()) if is_flagged)
+            if self._unknown:
+                found = REASONS[Verdict.CANNOT_KNOW] + (f"; suspected: {flagged}" if flagged else "")
+            elif flagged:
+                found = f"slip since the last report: {flagged}"
             values["verdict"] = REASONS[finding.verdict]
             for name, slipping, skidding in zip(self.names, finding.slipping.ravel(), finding.skidding.ravel()):
                 values[name] = "slipping" if slipping else "skidding" if skidding else "rolling"
             self._ever = finding.slipping | finding.skidding
             self._unknown = finding.verdict == Verdict.CANNOT_KNOW
-        if unknown and flagged:
-            return Status(WARN, f"{REASONS[Verdict.CANNOT_KNOW]}; suspected: {', '.join(flagged)}", values)
-        if unknown:
-            return Status(WARN, REASONS[Verdict.CANNOT_KNOW], values)
-        if flagged:
-            return Status(WARN, "slip since the last report: " + ", ".join(flagged), values)
-        if problems:
-            return Status(WARN, problems, values)
-        if silent:
-            return Status(WARN, f"no {silent} since the last report", values)
+        if found or problems or silent:
+            return Status(WARN, "; ".join(filter(None, [found, problems, silent])), values)
         # That nothing slips is more than encoders can say.
         return Status(OK, f"no slip of one wheel against another; {COMMON_SLIP}" if encoders_alone else "no slip", values)
 

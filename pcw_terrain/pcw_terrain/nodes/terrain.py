@@ -13,13 +13,12 @@ from sensor_msgs.msg import JointState
 from pcw_description import PcwError, load_robot
 from pcw_description.differential_kinematics import joint_matrix_blocks
 from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, Status
+from pcw_description.nodes.measured_joints import MeasuredJoints
 from pcw_description.nodes.node_tools import (
     LATCHED,
     SENSOR_SOURCE,
     SENSOR_STREAM,
     Decimator,
-    Silence,
-    StampWatch,
     all_declared,
     declare,
     fill_joint_state,
@@ -29,7 +28,6 @@ from pcw_description.nodes.node_tools import (
 )
 from pcw_description.robot_description import STEER
 
-from ..errors import TerrainError
 from ..ground_from_tests import GroundFromTests
 from ..observed_ground import ObservedGround
 from ..robot_terrain import RobotReading, RobotTerrainEstimate
@@ -80,10 +78,11 @@ class TerrainNode(Node):
         self._longest_gap = longest_gap
         self._odom: tuple[int, np.ndarray, np.ndarray] | None = None
         self._heard: JointState | None = None  # of terrain/tested, until the next step
-        self._watch, self._unusable, self._problems = StampWatch(longest_gap), 0, Problems(self)
-        self._silence = Silence(self._watch)
+        needed = ["position", "velocity"] if self._source == "observer" else ["position", "velocity", "effort"]
+        self._unusable, self._problems = 0, Problems(self)
+        self._joints = MeasuredJoints(self.robot, needed, self._problems, longest_gap)
+        self._watch = self._joints.watch
         self._due, self._map_due = Decimator(rate), Decimator(map_rate)
-        self._joint_index = {name: i for i, name in enumerate(self.robot.joint_names)}
         directions = [
             f"{caster}_{direction}" for caster in self.robot.caster_names for direction in ("longitudinal", "lateral")
         ]
@@ -130,6 +129,8 @@ class TerrainNode(Node):
             self._problems.add("odom is not finite; allowed: finite numbers")
 
     def _on_joint_states(self, message: JointState) -> None:
+        if not self._joints.are_in(message):
+            return
         dt = self._watch.update(message.header.stamp)
         if self._watch.repeated:
             return
@@ -150,8 +151,7 @@ class TerrainNode(Node):
         # Where nothing was vouched for in between, no time has passed for what the estimators remember.
         dt = min((now - self._stepped_at) * 1e-9, self._longest_gap) if self._stepped_at else 1e-3
         try:
-            position, velocity, effort = joint_state_arrays(joints, self._joint_index, (self.robot.n, 2))
-            self._check(position, velocity)
+            position, velocity, effort = self._joints.read(joints)
             if slip is None:
                 self._by_odom(position, velocity, effort, dt)
             elif not self._by_observer(position, velocity, slip, dt, now):
@@ -167,12 +167,6 @@ class TerrainNode(Node):
             self._publish(joints)
         if not first and self._map_due.due(dt) and self._map.known:
             self._publish_map(joints)
-
-    def _check(self, position: np.ndarray, velocity: np.ndarray) -> None:
-        """Raise a TerrainError for joints that are missing or not finite."""
-        missing = [n for n, i in self._joint_index.items() if not np.isfinite(position.ravel()[i] + velocity.ravel()[i])]
-        if missing:
-            raise TerrainError(f"joint_states lacks {', '.join(missing)}; allowed: all joints, finite position and velocity")
 
     def _by_odom(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float) -> None:
         assert self._odom is not None
@@ -267,7 +261,7 @@ class TerrainNode(Node):
         values: dict[str, object] = {"gaps": self._watch.gaps, "repeated_stamps": self._watch.repeats}
         values |= {"backward_jumps": self._watch.backward_jumps, "unusable_joint_states": self._unusable}
         values |= {"known_cells": self._map.known, "known_by_tests": int(self._tests.known.sum())}
-        problems, estimate = self._problems.take(), self._estimate
+        problems, estimate = self._joints.silence() or self._problems.take(), self._estimate
         if estimate is not None and estimate.valid.any():
             values |= {
                 "robot_mu_p": float(estimate.robot[0]),
@@ -276,8 +270,6 @@ class TerrainNode(Node):
             }
         if problems:
             return Status(WARN, problems, values)
-        if self._silence.since_last_report():
-            return Status(WARN, "no joint_states since the last report", values)
         if estimate is None:
             waits = "slip/observer with the stamps of" if self._source == "observer" else "odom near"
             return Status(WARN, f"no {waits} joint_states", values)
