@@ -68,7 +68,9 @@ class Diagnostics:
         parts: Callable[[], Mapping[str, Status]] | None = None,
     ) -> None:  # fmt: skip
         self._node, self._status, self._parts = node, status, parts
-        self._name, self._hardware_id = f"{node.get_name()}: {aspect}", hardware_id
+        # Robots that share a domain share the topic.
+        self._node_name = node.get_name() if node.get_namespace() == "/" else node.get_fully_qualified_name()
+        self._name, self._hardware_id = f"{self._node_name}: {aspect}", hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(period, self.report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -76,7 +78,7 @@ class Diagnostics:
         """Publish the status now."""
         statuses = {self._name: self._status()}
         for name, part in (self._parts() if self._parts is not None else {}).items():
-            statuses[f"{self._node.get_name()}: {name}"] = part
+            statuses[f"{self._node_name}: {name}"] = part
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [
