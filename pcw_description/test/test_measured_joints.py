@@ -65,6 +65,33 @@ def test_a_heading_that_is_wrapped_goes_on(joints: MeasuredJoints) -> None:
     np.testing.assert_allclose(read, true, atol=1e-12)
 
 
+def test_a_drive_that_is_wrapped_or_begins_anew_does_not_race(joints: MeasuredJoints, problems: Problems) -> None:
+    """A board that starts again counts from zero, within a period; odom had moved by all that the robot had driven."""
+    true = np.linspace(0.0, 30.0, 301)
+    read = []
+    for k, angle in enumerate(true):
+        joints.watch.update(ns_to_stamp(k * 10_000_000))
+        sent = np.full((4, 2), angle)
+        sent[:, 1] = 0.0
+        sent[0, 0] = (angle + math.pi) % math.tau - math.pi  # wrapped
+        if k >= 200:
+            sent[1, 0] -= 17.0  # began anew
+        read.append(joints.read(message(sent.ravel().tolist()))[0][:, 0])
+    read = np.array(read)
+    np.testing.assert_allclose(read[:, 0], true, atol=1e-9)
+    np.testing.assert_allclose(read[200:, 1], true[200:] - 0.1, atol=1e-9)  # what it moved in that period is not known
+    np.testing.assert_allclose(read[:, 2], true, atol=1e-9)
+    assert problems.take().startswith("joint_states: front_right_drive jumped by -16.9 rad in 0.01 s; allowed: 40 rad/s; ")
+
+
+def test_fast_drives_that_are_seldom_told_are_believed(joints: MeasuredJoints) -> None:
+    """At 10 Hz a wheel at its limit turns by 4 rad between two messages."""
+    for k in range(20):
+        joints.watch.update(ns_to_stamp(k * 100_000_000))
+        position, _, _ = joints.read(message([4.0 * k, 0.0] * 4))
+        assert (position[:, 0] == 4.0 * k).all()
+
+
 def test_what_is_missing_is_named_by_joint_and_field_without_what_was_measured(joints: MeasuredJoints) -> None:
     cases = (
         (message([1.25] * 7, names=NAMES[:7]), "lacks rear_right_steer; allowed: all joints of thesis"),

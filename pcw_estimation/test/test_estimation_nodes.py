@@ -34,12 +34,12 @@ def ros():
 class RollingRobot:
     """Publishes joint_states of a robot on a circle, 2 ms apart in its own time; every joint can be falsified."""
 
-    def __init__(self, ros):
+    def __init__(self, ros, topic="joint_states"):
         self.ros, self.time_ns = ros, 0
         self.position, self.extra_velocity = np.zeros((4, 2)), np.zeros((4, 2))
         axis = THESIS.steer_axis
         self.position[:, 1] = np.arctan2(TWIST[2] * axis[:, 0], TWIST[0] - TWIST[2] * axis[:, 1])
-        self.publisher = ros.peer.create_publisher(JointState, "joint_states", 1000)
+        self.publisher = ros.peer.create_publisher(JointState, topic, 1000)
 
     def publish(self, periods=5):
         for _ in range(periods):
@@ -154,6 +154,22 @@ def test_headings_that_are_wrapped_and_joints_of_others_do_not_move_odom(ros):
     robot.run(lambda: odom and stamp_to_ns(odom[-1].header.stamp) > 2e9)
     assert max(abs(m.twist.twist.linear.x - TWIST[0]) for m in odom) < 1e-3
     assert {s.message for d in diagnostics for s in d.status} <= {"integrating", "no joint_states since the last report"}
+
+
+def test_two_robots_in_one_domain_can_be_told_apart(ros):
+    """All nodes share /diagnostics, and each robot's odometry had the same name there."""
+    for namespace in ("a", "b"):
+        ros.start("pcw_estimation.nodes.odometry", "-r", f"__ns:=/{namespace}", "-p", f"base_frame:={namespace}/base_link")
+    diagnostics, odom = ros.listen(DiagnosticArray, "/diagnostics"), ros.listen(Odometry, "/a/odom")
+    robot = RollingRobot(ros, "/a/joint_states")
+
+    def statuses():
+        return {(s.name, s.message) for d in diagnostics for s in d.status}
+
+    robot.run(lambda: ("/a/odometry: odometry", "integrating") in statuses() and odom)
+    ros.wait_for(lambda: ("/b/odometry: odometry", "no joint_states since the last report") in statuses())
+    assert ("/b/odometry: odometry", "integrating") not in statuses()
+    assert odom[-1].child_frame_id == "a/base_link"
 
 
 def test_stamps_that_stand_still_are_said(ros):

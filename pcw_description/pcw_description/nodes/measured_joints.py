@@ -9,13 +9,14 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from pcw_description.errors import PcwError
-from pcw_description.robot_description import STEER, RobotDescription
+from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 
 from .diagnostics import Problems
 from .node_tools import StampWatch, joint_state_arrays
 
 FIELDS = ("position", "velocity", "effort")
 MOST_STRANGERS = 8  # joints of others that are named in a report
+LEEWAY = 1.5  # times its limit that the speed of a drive is possible
 
 
 class MeasuredJoints:
@@ -38,8 +39,9 @@ class MeasuredJoints:
         self._robot, self._needed, self._problems = robot, tuple(needed), problems
         self._index = {name: i for i, name in enumerate(robot.joint_names)}
         self._all = f"all joints of {robot.name}, in any order, in one message"
-        self._heading: np.ndarray | None = None  # as sent last
-        self._turns = np.zeros(robot.n)
+        self._sent: np.ndarray | None = None  # the last positions (n, 2), as they were sent
+        self._sent_ns = 0
+        self._offset = np.zeros((robot.n, 2))  # from the angle that is sent to the one that goes on
         self._strangers: dict[str, None] = {}
         self._reported = (0, 0)  # messages of the robot's joints, those of a stamp that came before
 
@@ -56,7 +58,8 @@ class MeasuredJoints:
         """Return position, velocity and effort (n, 2) of all joints; NaN for what is not needed and not sent.
 
         A heading that jumps by more than half a turn went the shorter way round: it is a wheel's direction, and drivers wrap
-        it at a full turn. Drives are taken as they are sent: how often they turned round cannot be known.
+        it at a full turn. So did a drive that would have been faster than it can be; where it was too fast that way as well,
+        its encoder began anew, and it goes on from where it was.
 
         Raises:
             PcwError: a joint is missing, or a needed number is missing or not finite; names it, and holds no measured number.
@@ -66,12 +69,28 @@ class MeasuredJoints:
         for field in self._needed:
             if not np.isfinite(arrays[field]).all():
                 raise PcwError(self._reason_against(message, field, arrays[field].ravel()))
-        heading = arrays["position"][:, STEER].copy()
-        if self._heading is not None:
-            self._turns -= np.round((heading - self._heading) / math.tau)
-        self._heading = heading
-        arrays["position"][:, STEER] += math.tau * self._turns
+        self._go_on(arrays["position"])
         return arrays["position"], arrays["velocity"], arrays["effort"]
+
+    def _go_on(self, position: np.ndarray) -> None:
+        """Take out of the positions (n, 2), in place, what is no motion."""
+        before, before_ns, now_ns = self._sent, self._sent_ns, self.watch.last_ns or 0
+        self._sent, self._sent_ns = position.copy(), now_ns
+        dt = (now_ns - before_ns) * 1e-9
+        if before is not None:
+            step = position - before
+            shorter = step - math.tau * np.round(step / math.tau)
+            self._offset[:, STEER] += (shorter - step)[:, STEER]
+            if 0.0 < dt <= self.watch.longest_gap:  # else nobody goes by the step
+                possible = LEEWAY * self._robot.speed_limit[:, DRIVE] * dt
+                for i in np.nonzero(np.abs(step[:, DRIVE]) > np.maximum(possible, math.pi))[0]:
+                    wraps = abs(shorter[i, DRIVE]) <= possible[i]
+                    self._offset[i, DRIVE] += (shorter[i, DRIVE] if wraps else 0.0) - step[i, DRIVE]
+                    if not wraps:
+                        jump = f"{self._robot.caster_names[i]}_drive jumped by {step[i, DRIVE]:.3g} rad in {dt:.3g} s"
+                        allowed = f"{self._robot.speed_limit[i, DRIVE]:g} rad/s"
+                        self._problems.add(f"joint_states: {jump}; allowed: {allowed}; taken for an encoder that begins anew")
+        position += self._offset
 
     def _reason_against(self, message: JointState, field: str, values: np.ndarray) -> str:
         lacking = [name for name in self._index if name not in message.name]
