@@ -88,7 +88,7 @@ SHAKING_PART = 0.5  # of that slip; what a tyre carries on average while it slip
 LARGEST_SWING = 0.01
 SHAKEN_PART = 0.05  # of the samples in which wheels shake is worth a word
 LIMITED_PART = 0.3  # of the samples in which their friction is used up is, too
-# What every model has a little wrong, of each wheel by itself, and not always by as much; and an IMU that leans with the chassis.
+# What every model has a little wrong, of each wheel by itself, and not always by as much; and an IMU leans with the chassis.
 DRIFTING = ("torque_constant_error", "tyre_longitudinal_stiffness", "tyre_lateral_stiffness", "imu_bias")
 # Part of a tolerance over which a number's column is taken anew: by a wider one's curvature an effect on it would be told
 # from the number itself, which is the same thing.
