@@ -54,6 +54,31 @@ def test_a_friction_that_is_described_sticks_all_the_same_and_so_it_does_in_othe
     assert told.valid.any(axis=1).sum() < 0.5 * alone.valid.any(axis=1).sum()
 
 
+def test_where_steerings_that_stick_stand_nearly_all_the_time_torques_count_as_their_friction_leaves_them():
+    """A dock or a corridor is driven straight on, with steerings that rub and stand.
+
+    Too little would have been left without those samples, so that all were judged as if no steering stuck: a healthy robot,
+    its friction described, had cogging steerings.
+    """
+    numbers = {"coulomb": 0.25, "smoothing_speed": CREEPS}
+    described = dataclasses.replace(ROBOT, physics=(EffectInstance("steer_coulomb_friction", ROBOT.caster_names, numbers),))
+    turning, straight = (
+        rubbing(ROBOT.caster_names, STICKS, excitation, duration)
+        for excitation, duration in (("identification", 20.0), ("chirp_x", 40.0))
+    )
+    builder = RobotProblemBuilder(described, [turning, straight])
+    problem = builder.build(keys=())
+    assert builder.held.all() and problem.valid.any(axis=1).mean() > 0.6
+    (told,) = [said for said in problem.remarks if said.startswith("Dry friction holds the steering of")]
+    assert "say little of torques" in told
+    # Up to 0.25 N m of each of four steerings over 30 mm: about as much where all stand, and a part where they turn.
+    doubted = problem.misjudged[:, :2].max(axis=1)
+    most = 2.0 * 0.25 / 0.03
+    rows = problem.valid.any(axis=1)
+    assert np.median(doubted[rows & (problem.recording == 1)]) > 0.5 * most
+    assert np.quantile(doubted[rows & (problem.recording == 0)], 0.2) < 0.5 * most
+
+
 @pytest.mark.parametrize(
     ("casters", "excitation"),
     [

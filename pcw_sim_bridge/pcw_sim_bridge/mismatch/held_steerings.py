@@ -2,11 +2,14 @@
 
 A simulation's friction, smoothed over a small speed, creeps instead, and at no speed is none. What a stuck steering holds
 would pass for something else that depends on where it stands, and its friction for less than it is. How large the friction is
-the samples tell in which steerings turn; those in which one that sticks stands tell nothing, and are not judged.
+the samples tell in which steerings turn; those in which one that sticks stands tell nothing, and are not judged. Where
+hardly any others are left, as of a robot that drives straight on, they tell as much as a torque that is wrong by up to that
+friction lets them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +22,7 @@ from .lost_torques import DRY_SPEED, FORCES, by_joint
 from .noise_model import channel_deviations
 from .regression_problem import BoolArray, FloatArray, Nuisance
 
-# Part of the judged samples that a steering has to stand in to be looked at, and that has to be left without those.
+# Part of the judged samples that a steering has to stand in to be looked at, and that has to be left to do without those.
 LEAST_PART, LEFT_PART = 0.05, 0.25
 LEAST_TURNING = 30  # samples that tell how large a friction is
 RUBS = 6.0  # standard errors from which on a steering rubs
@@ -28,14 +31,29 @@ LEFT_BEHIND = 2.0
 AT_MOST = 1.5  # times what the friction does where steerings turn, up to which it may do where they stand
 
 
+@dataclasses.dataclass(frozen=True)
+class HeldSteerings:
+    """Which steerings stick.
+
+    Attributes:
+        sticks: whether each does (n,).
+        friction: of those that stick, by the samples in which they turn (n,) [N m].
+        dispensable: whether enough is left without the samples in which they stand.
+    """
+
+    sticks: BoolArray
+    friction: FloatArray
+    dispensable: bool
+
+
 def held_steerings(
     robot: RobotDescription,
     differences: ChannelDifferences,
     valid: BoolArray,
     standing: BoolArray,
     instruments: Sequence[Nuisance],
-) -> BoolArray:
-    """Return which steerings (n,) rub and hold, while they stand, what no smoothed friction does.
+) -> HeldSteerings:
+    """Return which steerings rub and hold, while they stand, what no smoothed friction does.
 
     Args:
         robot: the nominal robot, some of whose steerings may be described to rub.
@@ -46,7 +64,7 @@ def held_steerings(
     """
     usable: BoolArray = valid[:, FORCES].min(axis=1)
     n = standing.shape[1]
-    nothing = np.zeros(n, dtype=bool)
+    nothing = HeldSteerings(np.zeros(n, dtype=bool), np.zeros(n), True)
     turning = usable & ~standing.any(axis=1)
     if turning.sum() < LEAST_TURNING:
         return nothing
@@ -68,7 +86,7 @@ def held_steerings(
     described = _described(robot)
     rubs = looked_at & ((described > 0.0) | (sizes[:n] > RUBS * errors[:n]))
     held = usable & standing[:, rubs].any(axis=1)
-    if not held.any() or (usable & ~held).sum() < LEFT_PART * usable.sum():
+    if not held.any():
         return nothing
     usual, there = (float(np.mean(left[rows] ** 2)) for rows in (turning, held))
     # A friction holds no more than its size: what is left of more than that is something else. Nor does what frictions do to
@@ -76,7 +94,9 @@ def held_steerings(
     found, whole = (np.where(rubs, more + sizes[:n], 0.0) for more in (0.0, described))
     seen, most = (float(np.mean((columns[turning, :, :n] @ of) ** 2)) for of in (found, whole))
     cancels = seen > AT_MOST**2 * float(np.mean(residual[turning] ** 2))
-    return rubs if LEFT_BEHIND**2 * usual < there < AT_MOST**2 * most and not cancels else nothing
+    if cancels or not LEFT_BEHIND**2 * usual < there < AT_MOST**2 * most:
+        return nothing
+    return HeldSteerings(rubs, np.maximum(whole, 0.0), bool((usable & ~held).sum() >= LEFT_PART * usable.sum()))
 
 
 def _described(robot: RobotDescription) -> FloatArray:

@@ -29,7 +29,7 @@ from .first_look import Looked, remainder
 from .found_effect import effect_instance
 from .held_steerings import held_steerings
 from .joint_balance import torque_of_motion
-from .lost_torques import by_joint, lost_torques
+from .lost_torques import DRY_SPEED, by_joint, lost_torques
 from .regression_problem import (
     BoolArray,
     Channel,
@@ -151,8 +151,8 @@ class RobotProblemBuilder:
         # By how much clocks are ahead that are far off; columns are taken as if that were known.
         self._leads, self._said = np.zeros(2), leads
         self._seeming: ModelNumbers | None = None
-        # Steerings that dry friction holds while they stand.
-        self.held, self._known_held = np.zeros(robot.n, dtype=bool), held
+        # Steerings that dry friction holds while they stand; how large it is where too little would be judged without these.
+        self.held, self._known_held, self._holding = np.zeros(robot.n, dtype=bool), held, np.zeros(robot.n)
         self.filters = [SignalFilter(motion.rate, self.cutoff) for motion in self.motions]
 
     @property
@@ -257,12 +257,13 @@ class RobotProblemBuilder:
                 differences = ChannelDifferences(self.model, self.motions, self.filters)
             valid = self._valid(differences)
             standing = [self._standing(motion)[:, STEER::2].astype(float) for motion in self.motions]
-            held = self._known_held
+            held, holding = self._known_held, np.zeros(self.robot.n)
             if held is None:
-                held = held_steerings(self.robot, differences, valid, differences.filtered(standing) > 0.5, instruments)
+                found = held_steerings(self.robot, differences, valid, differences.filtered(standing) > 0.5, instruments)
+                held, holding = found.sticks, np.where(found.dispensable, 0.0, found.friction)
             self._read = with_balanced_torques(self._read, differences, valid, instruments)
             self.motions = self._motions_of(self.model, leads=self._leads)
-            self.held = held
+            self.held, self._holding = held, holding
         return self._as_read()
 
     def _as_moved(self) -> list[RobotMotion]:
@@ -385,7 +386,8 @@ class RobotProblemBuilder:
         """What the model may misjudge in each sample (T, C): `slips` (T, C), see below, and what an IMU leans.
 
         Besides what joints lose where their dry friction reverses, what encoders do not resolve, and what drives that hold
-        speeds do not report while what accelerates their joints changes: a caster that flips is accelerated anew every moment.
+        speeds do not report while what accelerates their joints changes: a caster that flips is accelerated anew every moment;
+        and what dry friction holds of steerings that stand, where too little is left without them.
         """
         found, consistency = slips.copy(), self.layout.consistency
         if slips[:, consistency].size:
@@ -399,6 +401,9 @@ class RobotProblemBuilder:
             part = largest_unreported_part(differences.motions) / LOOP_BANDWIDTH
             loops = [part * derivative(motion.loops[..., 0], motion.rate) for motion in differences.motions]
             doubts = [np.hypot(own, more) for own, more in zip(doubts, loops, strict=True)] if lost else loops
+        if self._holding.any():
+            held = [self._held_back(motion) for motion in differences.motions]
+            doubts = [np.hypot(own, more) for own, more in zip(doubts, held, strict=True)] if doubts else held
         if doubts:
             each = [by_joint(own.reshape(len(own), -1, 1)) for own in doubts]
             found = np.sqrt(found**2 + np.sum(differences.of_torque(each) ** 2, axis=2))
@@ -460,13 +465,19 @@ class RobotProblemBuilder:
             bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
-                bad |= self._stuck(motion)
+                bad |= self._stuck(motion) & ~self._holding.any()
             pieces.append((bad[:, None] | ~known).astype(float))
         return (differences.filtered(pieces) < 0.1) & ~self._silent(differences)
 
     def _stuck(self, motion: RobotMotion) -> BoolArray:
         """Samples (T,) in which a steering that sticks stands, or turns so slowly that a smoothed friction is not whole."""
         return np.asarray(self._standing(motion, WHOLE_SPEED)[:, STEER::2][:, self.held].any(axis=1), dtype=bool)
+
+    def _held_back(self, motion: RobotMotion) -> FloatArray:
+        """What dry friction may hold of each joint (T, n, 2) [N m]: while a steering that sticks stands, up to all of it."""
+        found = np.zeros_like(motion.velocity)
+        found[:, :, STEER] = self._holding * (1.0 - np.abs(np.tanh(motion.velocity[:, :, STEER] / DRY_SPEED)))
+        return found
 
     def _standing(self, motion: RobotMotion, speed: float = HELD_SPEED) -> BoolArray:
         """Samples (T, 2n) in which a joint may be held by dry friction of unknown size: all but short moments of reversal."""
@@ -481,9 +492,12 @@ class RobotProblemBuilder:
         if not names:
             return ()
         part = np.mean(np.concatenate([self._stuck(motion) for motion in self.motions]))
+        what = "say nothing of torques, and were not judged."
+        if self._holding.any():
+            what = "say little of torques, but hardly any others are left. Turn the wheels more, and reverse."
         return (
             f"Dry friction holds the steering of {' and '.join(names)} against whatever is applied to it while it stands. The "
-            f"{100 * part:.0f} % of the samples in which it hardly turns say nothing of torques, and were not judged.",
+            f"{100 * part:.0f} % of the samples in which it hardly turns {what}",
         )
 
     def _silent(self, differences: ChannelDifferences) -> BoolArray:
