@@ -51,6 +51,14 @@ def test_a_drive_is_as_slow_and_as_late_as_it_is(pause: bool) -> None:
     assert all(name in line for name in THESIS.caster_names) and "dead time" in line and "time constant" in line
 
 
+def test_a_drive_that_answers_between_two_messages_is_late_by_less_than_one() -> None:
+    """A millisecond more of a command that is held changes no speed that is read: intervals had been as good as any."""
+    drives = [(1.0, 0.004, 0.002)] * THESIS.n
+    for response in speed_responses(THESIS, [recorded(drives)]):  # type: ignore[list-item]
+        assert np.all(np.abs(response.values - [1.0, 0.004, 0.002]) < [0.01, PERIOD, PERIOD])
+        assert np.all(response.deviations < [0.01, PERIOD, PERIOD])
+
+
 def test_intervals_hold_the_truth() -> None:
     """Of 20 recordings nearly all do so with three standard deviations."""
     within = []

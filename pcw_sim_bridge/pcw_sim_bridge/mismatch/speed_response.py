@@ -187,7 +187,10 @@ def _fitted(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, float | N
     loops = [left(np.concatenate([_looped(p, w) for p in pieces])) for w in BANDWIDTHS]
     best = int(np.argmin(loops))
     near = best > 0 and loops[best] < NEAR * float(rest @ rest)
-    return values, _scatter(predicted, values, rest), BANDWIDTHS[best] if near else None, float(np.sqrt(rest @ rest / total))
+    # Between two speeds nobody sees how late a command is that is held.
+    apart = float(np.median(np.concatenate([np.diff(piece.time) for piece in pieces])))
+    scatter = _scatter(predicted, values, rest, apart)
+    return values, scatter, BANDWIDTHS[best] if near else None, float(np.sqrt(rest @ rest / total))
 
 
 def _lag(piece: _Piece, constant: float) -> FloatArray:
@@ -207,9 +210,15 @@ def _looped(piece: _Piece, bandwidth: float) -> FloatArray:
     return np.asarray(np.interp(piece.time, np.arange(len(answer)) * piece.step, answer), dtype=np.float64)
 
 
-def _scatter(predicted: Callable[[FloatArray], FloatArray], values: FloatArray, rest: FloatArray) -> FloatArray:
-    """Standard deviations (3,) by what blocks of the recording say on their own, which holds for a rest of any colour."""
-    steps = np.array([1e-3 * abs(values[0]) + 1e-9, 1e-3, 1e-3])
+def _scatter(
+    predicted: Callable[[FloatArray], FloatArray], values: FloatArray, rest: FloatArray, apart: float
+) -> FloatArray:
+    """Standard deviations (3,) by what blocks of the recording say on their own, which holds for a rest of any colour.
+
+    Args:
+        apart: time between two speeds [s], the least by which an answer that is later looks otherwise.
+    """
+    steps = np.array([1e-3 * abs(values[0]) + 1e-9, apart, apart])
     plain = predicted(values)
     slopes = np.stack([(predicted(values + step) - plain) / step.max() for step in np.diag(steps)], axis=1)
     inverse = np.linalg.pinv(slopes.T @ slopes)
