@@ -438,6 +438,26 @@ def test_a_product_on_the_chassis_is_tried_and_is_a_file(tmp_path):
     assert not wrench[:, :2].any() and "v_x and v_y" in effect.summary
 
 
+def test_a_moment_by_the_heading_is_tried_and_is_a_file(tmp_path):
+    """A cable that winds up was among no hypotheses: its moment was said to depend on the time, which helped nothing."""
+    along = np.linspace(-4.0, 4.0, 60)
+    variables = {name: along for name in ("time", "x", "y", "v_x", "v_y", "omega", "speed", "yaw")}
+    casters = [f"{axis}_{what}/only" for axis in ("drive", "steer") for what in ("angle", "velocity", "torque")]
+    variables |= {name: along for name in (*casters, "drive_normal_force/only")}
+    sites = Sites(("drive_torque/only", "steer_torque/only", *ROWS), variables, 0.05, lambda torques: torques)
+    cable = Place("chassis_torque/z", Factor(), ((("yaw", 1.0),),))
+    [law] = [law for law in hypotheses(sites) if law.places == (cable,)]
+    assert law.depends_on == ("yaw",)
+    weights, *_ = np.linalg.lstsq(law.basis.functions([along]), -1.5 * along, rcond=None)
+    made = generate(law, weights, ["a_bag"])
+    effect = loaded(made, tmp_path / "effects")
+    at = np.zeros((50, FORCE_INPUTS))
+    at[:, POSE_YAW] = np.linspace(-3.9, 3.9, 50)
+    wrench = effect.contribution(at, made.parameters)
+    np.testing.assert_allclose(wrench[:, -1], -1.5 * at[:, POSE_YAW], atol=0.3)  # over more than a turn, as a cable counts
+    assert not wrench[:, :2].any()
+
+
 def test_what_explains_one_channel_of_many_is_seen():
     """A keel's moment explained 99 % of one channel of 17, and was worth less than its numbers cost: no law was tried."""
     rng, samples, channels = np.random.default_rng(0), 200, 17

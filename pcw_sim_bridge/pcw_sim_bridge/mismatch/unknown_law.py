@@ -346,7 +346,8 @@ def _forces(
 ) -> Iterator[tuple[tuple[Place, ...], tuple[str, ...]]]:
     """Yield forces on the chassis: along an axis of the world or of the robot, along the motion or with it, and a moment.
 
-    A force or moment along an axis of the robot may also be a product of one component of the twist and a function of another.
+    A force or moment along an axis of the robot may also be a product of one component of the twist and a function of another,
+    and a moment a function of the heading.
     """
     width = DIRECTION_WIDTH * top_of(variables["speed"])
 
@@ -364,6 +365,7 @@ def _forces(
     for name in shared:
         for places in along((((name, 1.0),),)):
             yield places, _kinds(name)
+    yield (Place("chassis_torque/z", Factor(), ((("yaw", 1.0),),)),), _kinds("yaw")  # as of a cable that winds up
     for site in ("chassis_force/x", "chassis_force/y", "chassis_torque/z"):
         for one, other in itertools.permutations(("v_x", "v_y", "omega"), 2):
             yield (Place(site, Factor("value", one), (((other, 1.0),),)),), _kinds(other)
