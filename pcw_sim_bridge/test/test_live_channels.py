@@ -3,7 +3,10 @@
 import copy
 import dataclasses
 import json
+import pickle
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +80,68 @@ def test_a_healthy_robot_stays_near_one_and_a_fault_is_seen_where_it_is(friction
     # The torques feel it, and the slip that is foretold from them: not what the IMU and the tracker measure.
     departed = {state.name.partition("/")[0] for state in last.channels if state.level is not Level.OK}
     assert "chassis_force" in departed and departed <= {"chassis_force", "chassis_torque", "rolling_consistency"}
+
+
+def test_stamps_that_never_change_are_told(friction: list[RawMessage]) -> None:
+    """The reader said "live holds no messages; record it again"."""
+    live, told = LiveChannels(THESIS, PARAMETERS), []
+    for k, message in enumerate(friction[:2000]):
+        states = ros_messages.typestore().deserialize_cdr(message.cdr, message.type_name)
+        states.header.stamp.sec = states.header.stamp.nanosec = 0
+        live.receive(message.topic, message.type_name, ros_messages.serialise(states))
+        if k % 300 == 299:
+            told.append(live.update().problems)
+    assert len(told) == 6
+    assert set(told[1:]) == {("all joint_states have the stamp 0.000000000 s; allowed: the time of each measurement",)}
+
+
+def test_a_missing_joint_is_told_also_when_there_would_be_enough_to_learn_from(friction: list[RawMessage]) -> None:
+    live = LiveChannels(THESIS, LiveParameters(learning=5.0))
+    lacking = THESIS.joint_names[-1]
+    sent = []
+    for message in friction:
+        if message.topic == "/joint_states" and message.log_time_ns < 9e9:
+            states = ros_messages.typestore().deserialize_cdr(message.cdr, message.type_name)
+            stamp, last = header_stamp(message.cdr), states.name.index(lacking)
+            names = [name for name in states.name if name != lacking]
+            values = (np.delete(getattr(states, field), last) for field in ("position", "velocity", "effort"))
+            sent.append(message._replace(cdr=ros_messages.serialise(ros_messages.joint_state(stamp, names, *values))))
+    judged = [judgement for _, judgement, _ in judgements(live, iter(sent))]
+    assert judged[-1].learned > 5.0 and not judged[-1].ready
+    assert any(f"{lacking} is in no message" in problem for problem in judged[-1].problems)
+
+
+WARMED_UP = """
+import gc, pickle, sys
+from numba.core.dispatcher import Dispatcher
+from pcw_description import load_robot
+from pcw_description.recording_files import RawMessage
+from pcw_sim_bridge.mismatch.live_channels import LiveChannels, LiveParameters
+from pcw_sim_bridge.mismatch.live_trials import judgements
+
+def kernels():
+    found = [kernel for kernel in gc.get_objects() if isinstance(kernel, Dispatcher)]
+    return {(kernel.__module__, kernel.__name__, str(signature)) for kernel in found for signature in kernel.signatures}
+
+live = LiveChannels(load_robot("thesis"), LiveParameters(learning=10.0))
+live.warm_up()
+warm = kernels()
+sent = [RawMessage(*message) for message in pickle.load(open(sys.argv[1], "rb"))]
+judged = [judgement for _, judgement, _ in judgements(live, iter(sent))]
+assert judged[-1].suspect is not None
+print(len(warm), kernels() - warm)
+"""
+
+
+def test_nothing_is_left_to_compile_where_messages_wait(friction: list[RawMessage], tmp_path: Path) -> None:
+    """The monitor compiled when it had learned, for half a minute in which it neither said anything nor ended on SIGINT."""
+    pytest.importorskip("numba")
+    sent = tmp_path / "sent.pickle"
+    sent.write_bytes(pickle.dumps([tuple(message) for message in friction]))
+    command = [sys.executable, "-c", WARMED_UP, str(sent)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    warm, left = result.stdout.split(maxsplit=1)
+    assert int(warm) > 10 and left.strip() == "set()"
 
 
 def test_an_imu_without_accelerometer_is_watched_for_what_it_has(friction: list[RawMessage]) -> None:

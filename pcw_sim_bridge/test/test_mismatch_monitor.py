@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from pcw_control.excitation import make_excitation  # noqa: E402
 from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import NodeProcess, RosTest  # noqa: E402
-from pcw_description.nodes.node_tools import SENSOR_STREAM_SOURCE, stamp_to_ns  # noqa: E402
+from pcw_description.nodes.node_tools import SENSOR_STREAM_SOURCE, SETTING_UP, stamp_to_ns  # noqa: E402
 from pcw_description.recording import Recording  # noqa: E402
 from pcw_description.recording_files import RawMessage  # noqa: E402
 from pcw_sim_bridge.mismatch.live_channels import LiveChannels, LiveParameters  # noqa: E402
@@ -147,6 +148,31 @@ def test_it_learns_saves_learns_again_and_only_listens(sent: list[RawMessage], t
             while_doing=robot.send, every=0.03,
         )  # fmt: skip
         assert node.interrupt() == 0
+
+
+@pytest.mark.nightly
+def test_after_an_installation_it_compiles_before_it_runs(sent: list[RawMessage], tmp_path: Path) -> None:
+    """It compiled when it had learned, and neither said anything nor ended on SIGINT for as long."""
+    pytest.importorskip("numba")
+    with RosTest() as ros:
+        ros.environment["NUMBA_CACHE_DIR"] = str(tmp_path)
+        node = start(ros, "learning:=5.0")
+        diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+        ros.wait_for(lambda: statuses(diagnostics, "mismatch"))
+        assert SETTING_UP in node.log
+        robot, heard = Robot(ros, sent), [time.monotonic()]
+
+        def send() -> None:
+            robot.send()
+            if diagnostics:
+                heard.append(time.monotonic())
+                told.extend(statuses(diagnostics, "chassis_torque/z"))
+                diagnostics.clear()
+
+        told: list[DiagnosticStatus] = []
+        ros.wait_for(lambda: told, while_doing=send, every=0.03)
+        assert max(np.diff(heard)) < 5.0
+        assert node.interrupt(deadline=5.0) == 0 and "Traceback" not in node.log
 
 
 @pytest.mark.parametrize(

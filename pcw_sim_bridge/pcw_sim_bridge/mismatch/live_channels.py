@@ -15,23 +15,27 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import math
 import struct
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
 from pcw_description.errors import RecordingError
 from pcw_description.recording import Recording
 from pcw_description.recording_files import RawMessage
-from pcw_description.robot_description import DRIVE, RobotDescription
+from pcw_description.robot_description import DRIVE, GRAVITY, RobotDescription
+from pcw_description.ros_messages import imu, joint_state, odometry, serialise, type_name_of
 
 from .errors import MismatchError
 from .even_stamps import EvenStamps
 from .joint_glitches import without_glitches
-from .live_rows import LONGEST_WINDOW, NANOSECONDS, RowReader, Rows
+from .live_rows import LONGEST_WINDOW, NANOSECONDS, RowReader, Rows, Window
 from .live_suspects import Suspect, find_suspect
 from .live_tuning import Tuning, digest
 from .message_ring import MessageRing
+from .noise_model import robust_deviation
 from .regression_problem import FloatArray
 from .robot_channels import STILL_SPEED, RobotProblemBuilder
 from .robot_motion import SHORTEST_SEGMENT
@@ -204,6 +208,11 @@ class LiveChannels:
         if self._reader is not None:
             self._reader.restart()
 
+    def warm_up(self) -> None:
+        """Have everything compiled that learning and judging need, before anybody waits for it."""
+        self._first_window(imagined_motion(self.robot))
+        robust_deviation(np.ones(1))
+
     def learn_again(self) -> None:
         """Forget what was learned, and begin anew with the motion from now on."""
         self._restart()
@@ -215,6 +224,9 @@ class LiveChannels:
         try:
             if self._now is None:
                 return self._nothing("nothing has been received")
+            if self._now == self._read_until:
+                still = f"all joint_states have the stamp {self._now / NANOSECONDS:.9f} s"
+                return self._nothing(f"{still}; allowed: the time of each measurement")
             if self._reader is None or self.tuning is None:
                 return self._learn()
             return self._judge(self._reader, self.tuning)
@@ -243,19 +255,26 @@ class LiveChannels:
         problems = tuple(str(warning) for warning in fresh.warnings)
         if self._learned() < self.parameters.learning:
             return self._nothing(*problems)
-        stamps = EvenStamps()
-        recording, told = without_glitches(stamps.evenly_stamped(Recording.of_messages(self._ring.since(0), self.robot)))
-        builder = RobotProblemBuilder(self.robot, [recording], live=True)
-        reader = RowReader(self.robot, builder.cutoff, stamps)
-        window = reader.go_on(recording, builder, told)
-        rate = float(np.mean([f.decimated_rate for f in builder.filters]))
-        layout = window.layout.without(builder.unmeasured)
-        rows, _ = layout.arranged(window.layout, window.rows)
-        self.tuning = Tuning.learn(digest(self.robot), builder.cutoff, layout, rows, rate)
+        try:
+            reader, window, told = self._first_window(self._ring.since(0))
+            rate = float(np.mean([f.decimated_rate for f in window.builder.filters]))
+            layout = window.layout.without(window.builder.unmeasured)
+            rows, _ = layout.arranged(window.layout, window.rows)
+            self.tuning = Tuning.learn(digest(self.robot), reader.cutoff, layout, rows, rate)
+        except (RecordingError, MismatchError) as error:
+            return self._nothing(*problems, str(error))
         self._reader = reader
         self._moved.clear()
         self._ring = self._ring_for(LONGEST_WINDOW)
         return self._nothing(*problems, *told)
+
+    def _first_window(self, messages: Sequence[RawMessage]) -> tuple[RowReader, Window, Sequence[str]]:
+        """Read messages before which there was nothing; the reader goes on from there. Also what was wrong with them."""
+        stamps = EvenStamps()
+        recording, told = without_glitches(stamps.evenly_stamped(Recording.of_messages(messages, self.robot)))
+        builder = RobotProblemBuilder(self.robot, [recording], live=True)
+        reader = RowReader(self.robot, builder.cutoff, stamps)
+        return reader, reader.go_on(recording, builder, told), told
 
     # --- Judging ----------------------------------------------------------------------------------------
 
@@ -351,6 +370,23 @@ def onset(time: FloatArray, standard: FloatArray, size: float) -> float:
     threshold = 0.5 * (1.0 + size**2)
     excess = np.minimum(standard**2, 4.0 * threshold) - threshold
     return float(time[np.argmax(np.cumsum(excess[::-1])[::-1])])
+
+
+def imagined_motion(robot: RobotDescription) -> list[RawMessage]:
+    """What a robot would send that rolls straight on for two seconds, now faster, now slower."""
+    messages = []
+    for time in np.arange(0.0, 2.0, 0.01).tolist():
+        stamp = NANOSECONDS + round(time * NANOSECONDS)
+        wave, acceleration = math.sin(5.0 * time), math.cos(5.0 * time)
+        way, speed = 0.5 * time - 0.02 * acceleration, 0.5 + 0.1 * wave
+        turn, rate, torque = (np.outer(1.0 / robot.wheel_radius, (along, 0.0)) for along in (way, speed, acceleration))
+        for topic, message in (
+            ("/joint_states", joint_state(stamp, robot.joint_names, turn, rate, torque)),
+            ("/imu/data", imu(stamp, (0.0, 0.0, 1e-3 * speed), (0.5 * acceleration, 0.0, GRAVITY))),
+            ("/ground_truth/odom", odometry(stamp, (way, 0.0, 0.0), (speed, 0.0, 0.0))),
+        ):
+            messages.append(RawMessage(topic, type_name_of(message), stamp, serialise(message)))
+    return messages
 
 
 def _rms(values: FloatArray) -> float:

@@ -70,6 +70,7 @@ class MismatchMonitorNode(Node):
         self._keeper = self._make_keeper()
         tuning = Tuning.load(calibration, self.robot) if calibration else None
         self._live = LiveChannels(self.robot, parameters, tuning)
+        self._live.warm_up()
         self._saved = bool(calibration)
         self._judgement: Judgement | None = None
         self._departed = ""  # what departed when there was last something to judge
