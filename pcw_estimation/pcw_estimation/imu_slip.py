@@ -232,6 +232,14 @@ class ImuSlip:
         after[_P:_SUMS] = covariance.ravel()
         return after
 
+    def without_imu(self, state: FloatArray) -> FloatArray:
+        """Return the state with the pose, and nothing else of what an IMU has said that turned out to be wrong."""
+        after = self.initial_state()
+        after[:UX] = state[:UX]
+        covariances = (after[_P:_SUMS].reshape(_STATES, _STATES), state[_P:_SUMS].reshape(_STATES, _STATES))
+        covariances[0][:UX, :UX] = covariances[1][:UX, :UX]
+        return after
+
     def predict(self, state: FloatArray, gyro: float, acceleration_x: float, acceleration_y: float, dt: float) -> FloatArray:
         """Carry the state on by one sample of the IMU.
 

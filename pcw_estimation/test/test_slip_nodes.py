@@ -29,10 +29,10 @@ def ros():
 
 
 class Robot:
-    """Publishes joint_states at 500 Hz and imu/data at 250 Hz, both in its own time, of a robot that drives straight on."""
+    """Publishes joint_states at 500 Hz and imu/data at 250 Hz, both in its own time, of a robot that drives straight on or turns."""
 
     def __init__(self, ros, with_imu=True):
-        self.ros, self.time_ns, self.count = ros, 0, 0
+        self.ros, self.time_ns, self.count, self.turning = ros, 0, 0, 0.0
         self.position, self.speed, self.shown_speed = np.zeros((4, 2)), 0.0, None
         self.names, self.order, self.falsify, self.gyro = NAMES, list(range(8)), lambda position, velocity: None, 0.0
         self.joints = ros.peer.create_publisher(JointState, "joint_states", 1000)
@@ -41,7 +41,7 @@ class Robot:
     def publish(self, periods=5):
         for _ in range(periods):
             shown = self.speed if self.shown_speed is None else self.shown_speed
-            rates = inverse_kinematics(THESIS, np.zeros(4), np.array([shown, 0.0, 0.0]))
+            rates = inverse_kinematics(THESIS, self.position[:, 1], np.array([shown, 0.0, self.turning]))
             self.position = self.position + 0.002 * rates
             self.time_ns += 2_000_000
             self.count += 1
@@ -169,6 +169,29 @@ def test_all_wheels_that_spin_are_said_to_slip_and_do_not_move_odom(ros):
     covariance = np.reshape(last.pose.covariance, (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])]
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     assert slip_node.interrupt() == 0 and fusion.interrupt() == 0
+
+
+def test_a_gyro_in_degrees_is_named_and_left_out(ros):
+    """All wheels slipped, for all that was said, and the odometry turned with the gyro."""
+    nodes = [ros.start("pcw_estimation.nodes.imu_slip"), ros.start("pcw_estimation.nodes.slip_fusion")]
+    diagnostics, twist = ros.listen(DiagnosticArray, "/diagnostics"), ros.listen(TwistWithCovarianceStamped, "slip/twist")
+    robot = Robot(ros)
+    ros.wait_for(lambda: robot.joints.get_subscription_count() > 1 and robot.imu.get_subscription_count() > 1)
+    robot.run_for(0.5)
+    robot.turning, robot.gyro = 0.5, math.degrees(0.5)
+    told = "imu/data: angular_velocity.z turns 57.3 times as far as the wheels; it looks as if it is in degrees/s; allowed: rad/s"
+
+    def last():
+        return [statuses(diagnostics).get(name) for name in ("imu_slip: slip", "slip_fusion: fusion")]
+
+    robot.run(lambda: all(status is not None and told in status.message for status in last()))
+    robot.run_for(2.5)
+    assert [status.level for status in last()] == [DiagnosticStatus.WARN] * 2
+    assert not any("slip since" in status.message or "all wheels" in status.message for status in last())
+    values = {entry.key: entry.value for entry in last()[1].values}
+    assert values["imu_in_use"] == "False" and int(values["unusable_imu"]) > 100
+    assert twist[-1].twist.twist.angular.z == pytest.approx(0.5, abs=0.02)
+    assert [node.interrupt() for node in nodes] == [0, 0]
 
 
 def test_bad_stamps_and_numbers_are_counted_and_nothing_of_them_leaves(ros):

@@ -21,6 +21,7 @@ from pcw_description.nodes.node_tools import (
     stamp_to_ns,
 )
 
+from ..gyro_unit import GyroUnit
 from ..imu_slip import ImuSlip, ImuSlipParameters, Motion
 from ..slip_verdict import ConfirmParameters
 from .slip_topics import declare_noise, stamp_values
@@ -72,7 +73,7 @@ class ImuStream:
         self._problems = Problems(node)
         self._measured_joints = MeasuredJoints(robot, ["position", "velocity"], self._problems, longest_gap)
         self.joints, self.imu = self._measured_joints.watch, StampWatch(longest_gap)
-        self._imu_silence = Silence(self.imu)
+        self._imu_silence, self._gyro_unit = Silence(self.imu), GyroUnit(robot)
         self._unusable, self._unusable_imu, self._late = 0, 0, 0
         self._warm_up()
         self._state = self.filter.initial_state()
@@ -99,6 +100,11 @@ class ImuStream:
             self._unusable_imu += 1
             return
         gyro, acceleration = message.angular_velocity, message.linear_acceleration
+        self._gyro_unit.add_gyro(now_ns, gyro.z)
+        if self._gyro_unit.fault:
+            self._unusable_imu += 1
+            self._problems.add(self._gyro_unit.fault)
+            return
         try:
             # A sample older than the state only takes the place of the last one: 1 ns is no time to carry on.
             self._state = self.filter.predict(self._state, gyro.z, acceleration.x, acceleration.y, max(elapsed, 1e-9))
@@ -119,6 +125,7 @@ class ImuStream:
         event_ns = now_ns if self._event_ns is None else self._event_ns
         state, ahead = self._state, 0.0
         if dt is None:
+            self._gyro_unit.clear()
             # An IMU that went on all the while knows the speed; else nobody does.
             if not 0 <= now_ns - event_ns <= self._timeout_ns or self.joints.count == 1:
                 state = self.filter.interrupted(state, self.joints.last_gap)
@@ -136,6 +143,10 @@ class ImuStream:
             self._problems.add(str(error))
             return
         self._event_ns = max(now_ns, event_ns)
+        was_at_fault = bool(self._gyro_unit.fault)
+        self._gyro_unit.add_joints(now_ns, position, velocity)
+        if self._gyro_unit.fault and not was_at_fault:
+            self._state = self.filter.without_imu(self._state)
         self._on_motion(message.header.stamp, dt, motion)
 
     def silent(self) -> str:
