@@ -1,6 +1,7 @@
 """Slip and faults as processes over real DDS: what is said, what is left out, and that nothing that is not finite is sent."""
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -192,6 +193,25 @@ def test_a_gyro_in_degrees_is_named_and_left_out(ros):
     assert values["imu_in_use"] == "False" and int(values["unusable_imu"]) > 100
     assert twist[-1].twist.twist.angular.z == pytest.approx(0.5, abs=0.02)
     assert [node.interrupt() for node in nodes] == [0, 0]
+
+
+def test_flags_that_come_and_go_are_not_told_dozens_of_times_a_second(ros):
+    ros.start("pcw_estimation.nodes.encoder_slip", "-p", "confirm_time:=0.002")
+    diagnostics, robot = ros.listen(DiagnosticArray, "/diagnostics"), Robot(ros, with_imu=False)
+
+    def comes_and_goes(position, velocity):
+        if robot.count // 10 % 2:
+            velocity[robot.count // 20 % 4, 0] += 5.0
+
+    robot.speed = 0.5
+    robot.run(lambda: diagnostics)
+    robot.falsify = comes_and_goes
+    robot.run(lambda: "slip since" in said(diagnostics))
+    diagnostics.clear()
+    begun = time.monotonic()
+    robot.run(lambda: time.monotonic() > begun + 3.0)
+    told = [status.message for d in diagnostics for status in d.status if status.name == "encoder_slip: slip"]
+    assert 6 <= len(told) <= 13 and all("slip since the last report: " in message for message in told)
 
 
 def test_bad_stamps_and_numbers_are_counted_and_nothing_of_them_leaves(ros):

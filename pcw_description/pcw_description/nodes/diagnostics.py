@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
+import time
 from collections.abc import Callable, Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -52,8 +54,12 @@ class Problems:
         return "; ".join(self._reported.values())
 
 
+# News are told so long after the report before at the earliest [s]: flags may come and go with every measurement.
+NEWS_PERIOD = 0.25
+
+
 class Diagnostics:
-    """Publishes a node's status regularly and on demand.
+    """Publishes a node's status on demand, and regularly where there was no demand.
 
     Args:
         node: the node; its name and `aspect` name the status.
@@ -72,10 +78,20 @@ class Diagnostics:
         self._node_name = node.get_name() if node.get_namespace() == "/" else node.get_fully_qualified_name()
         self._name, self._hardware_id = f"{self._node_name}: {aspect}", hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        node.create_timer(period, self.report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._news, self._reported = False, -math.inf
+        self._timer = node.create_timer(period, self.report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def report_news(self, news: bool) -> None:
+        """Say, as often as there is something to look at, whether it was news; they are published soon, and not too often."""
+        self._news |= news
+        if self._news and time.monotonic() >= self._reported + NEWS_PERIOD:
+            self.report()
 
     def report(self) -> None:
         """Publish the status now."""
+        # What is told "since the last report" needs time to happen.
+        self._timer.reset()
+        self._news, self._reported = False, time.monotonic()
         statuses = {self._name: self._status()}
         for name, part in (self._parts() if self._parts is not None else {}).items():
             statuses[f"{self._node_name}: {name}"] = part

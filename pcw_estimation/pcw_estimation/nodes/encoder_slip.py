@@ -120,8 +120,7 @@ class EncoderSlipNode(Node):
             if dt is None:
                 self._faults.reset()
             news |= self._faults.update(position, velocity, finding, dt or 0.0, effort, self._commanded)
-        if news:
-            self._diagnostics.report()
+        self._diagnostics.report_news(news)
         if dt is not None and self._decimator.due(dt):
             self._topic.publish(message.header.stamp, finding)
 

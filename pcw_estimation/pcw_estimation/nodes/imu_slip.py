@@ -36,8 +36,7 @@ class ImuSlipNode(Node):
         all_slip = motion.all_slip and flagged
         news = self._topic.take(motion.finding) or (all_slip and not self._all_slip)
         self._all_slip |= all_slip
-        if news:
-            self._diagnostics.report()
+        self._diagnostics.report_news(news)
         # Without an IMU this is the encoders' opinion, which has a topic of its own.
         if motion.inertial and dt is not None and self._decimator.due(dt):
             self._topic.publish(stamp, motion.finding)
