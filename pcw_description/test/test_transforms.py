@@ -173,6 +173,28 @@ def test_without_base_the_links_alone_and_only_those_that_are_known(ros, viewer)
     assert len(viewer.frames()) == count  # each measurement once
 
 
+def test_joints_of_others_hide_none_of_the_robot_and_are_no_problem(ros, viewer):
+    """An arm on the same topic, if its message was the newest, took the links away, and each joint was missed in a warning."""
+    ros.start(TRANSFORMS, "-p", "base:=none", "-p", "rate:=10.0")
+    diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
+
+    def arm():
+        state = JointState(name=["arm_1", "arm_2"], position=[0.1, 0.2])
+        state.header.stamp = ns_to_stamp(viewer.time_ns + 1_000_000)
+        viewer.states.publish(state)
+
+    def both():
+        viewer.publish()
+        arm()
+
+    ros.wait_for(lambda: len(viewer.frames()) > 20, while_doing=both)
+    ros.wait_for(lambda: len(diagnostics) > 2, while_doing=both)
+    assert "rear_left_fork" in {child for _, child, *_ in viewer.frames()}
+    assert not any("no position of" in status.message or "arm_1" in status.message for d in diagnostics for status in d.status)
+    told = "joint_states names arm_1, arm_2 and no joint of thesis"
+    ros.wait_for(lambda: any(told in status.message for status in diagnostics[-1].status), while_doing=arm)
+
+
 @pytest.mark.parametrize(
     ("parameter", "complaint"), [("robot:=/no/such/robot.yaml", "/no/such/robot.yaml"), ("base:=odmo", "did you mean 'odom'?")]
 )

@@ -36,7 +36,9 @@ def turning(time):
 
 
 @pytest.mark.parametrize(("joint_rate", "imu_rate"), [(1000.0, 200.0), (50.0, 100.0), (100.0, 20.0), (10.0, 10.0)])
-@pytest.mark.parametrize(("factor", "looks"), [(1.0 / DEGREE, "is in degrees/s"), (DEGREE, "was taken from degrees/s to rad/s twice")])
+@pytest.mark.parametrize(
+    ("factor", "looks"), [(1.0 / DEGREE, "is in degrees/s"), (DEGREE, "was taken from degrees/s to rad/s twice")]
+)
 def test_another_unit_is_told_at_any_rate(factor, looks, joint_rate, imu_rate):
     rng = np.random.default_rng(1)
     faults = drive(

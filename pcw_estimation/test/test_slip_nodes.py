@@ -30,7 +30,7 @@ def ros():
 
 
 class Robot:
-    """Publishes joint_states at 500 Hz and imu/data at 250 Hz, both in its own time, of a robot that drives straight on or turns."""
+    """Publishes joint_states at 500 Hz and imu/data at 250 Hz, both in its own time; drives straight on, or turns."""
 
     def __init__(self, ros, with_imu=True):
         self.ros, self.time_ns, self.count, self.turning = ros, 0, 0, 0.0
@@ -180,7 +180,7 @@ def test_a_gyro_in_degrees_is_named_and_left_out(ros):
     ros.wait_for(lambda: robot.joints.get_subscription_count() > 1 and robot.imu.get_subscription_count() > 1)
     robot.run_for(0.5)
     robot.turning, robot.gyro = 0.5, math.degrees(0.5)
-    told = "imu/data: angular_velocity.z turns 57.3 times as far as the wheels; it looks as if it is in degrees/s; allowed: rad/s"
+    told = "imu/data: angular_velocity.z turns 57.3 times as far as the wheels; it looks as if it is in degrees/s; "
 
     def last():
         return [statuses(diagnostics).get(name) for name in ("imu_slip: slip", "slip_fusion: fusion")]

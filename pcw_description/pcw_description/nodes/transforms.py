@@ -19,6 +19,7 @@ from ..frame_tree import Frame, PoseTrack, drift_of_odometry, planar_frame, robo
 from ..robot_description import DRIVE, STEER
 from ..robot_file import load_robot
 from .diagnostics import OK, WARN, Diagnostics, Problems, Status
+from .measured_joints import MeasuredJoints
 from .node_tools import (
     SENSOR,
     SENSOR_STREAM,
@@ -66,16 +67,20 @@ class TransformsNode(Node):
         self._poses: dict[str, Odometry] = {}  # the newest by topic, until used
         self._tracks = {topic: PoseTrack() for topic in BASES[self._base]}
         self._sent, self._problems = 0, Problems(self)
+        self._joints = MeasuredJoints(self.robot, ["position"], self._problems) if joints else None
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
-        if joints:
-            self.create_subscription(JointState, "joint_states", self._on_joint_states, SENSOR)
+        if self._joints is not None:
+            on_joint_states = partial(self._on_joint_states, self._joints)
+            self.create_subscription(JointState, "joint_states", on_joint_states, SENSOR)
         for topic in BASES[self._base]:
             self.create_subscription(Odometry, topic, partial(self._on_pose, topic), SENSOR_STREAM)
         self.create_timer(1.0 / rate, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = Diagnostics(self, self.robot.name, self._status, aspect="transforms")
 
-    def _on_joint_states(self, message: JointState) -> None:
-        self._joint_states = message
+    def _on_joint_states(self, joints: MeasuredJoints, message: JointState) -> None:
+        if joints.are_in(message):
+            joints.watch.update(message.header.stamp)
+            self._joint_states = message
 
     def _on_pose(self, topic: str, message: Odometry) -> None:
         position, rotation = message.pose.pose.position, message.pose.pose.orientation
@@ -126,10 +131,11 @@ class TransformsNode(Node):
         return [_transform(planar_frame(parent, child, pose), time_ns)]
 
     def _status(self) -> Status:
-        problems, sent = self._problems.take(), self._sent
+        silence = self._joints.silence() if self._joints is not None else ""
+        problems, sent = self._problems.take() or silence, self._sent
         self._sent = 0
         level, text = (WARN, problems) if problems else (OK, "publishing")
-        if not sent:
+        if not sent and not problems:
             level, text = WARN, "nothing to publish since the last report"
         return Status(level, text, {"transforms_since_last_report": sent})
 
