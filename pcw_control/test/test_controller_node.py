@@ -418,6 +418,8 @@ def test_a_pushed_robot_lets_go_when_the_sensor_falls_silent_or_lies(ros):
     ros.wait_for(lambda: sensor.get_subscription_count() > 0)
     gives_way = lambda: bool(robot.commands) and robot.torque[:, 0].sum() > 0.05  # noqa: E731
     robot.run(lambda: push() or gives_way(), cmd_vel=False)
+    told = "following ft_sensor/wrench"  # it was "following cmd_vel", which nobody sends
+    robot.run(lambda: push() or any(told == status.message for d in diagnostics for status in d.status), cmd_vel=False)
     # Silent. On a busy machine it may let go for want of joint_states first, so the robot goes on until it says why.
     robot.run(lambda: robot.let_go() and "no ft_sensor/wrench" in warnings_of(diagnostics), cmd_vel=False)
     robot.run(lambda: push() or bool(robot.torque.any()), cmd_vel=False)

@@ -108,6 +108,15 @@ def test_the_other_methods_have_the_same_interface(ros, method):
         assert all(len(m.position) == len(m.effort) == 0 for m in slip)
 
 
+def test_that_it_begins_anew_after_a_gap_is_told(ros):
+    """With messages as seldom as longest_gap allows, and stamps that tremble, every other one was a gap, and all was well."""
+    _, slip, diagnostics, robot = start(ros)
+    robot.run(lambda: len(slip) > 30 and len(slip[-1].velocity) > 0)
+    robot.time_ns += 105_000_000
+    told = "; allowed: at most longest_gap = 0.1 s; it begins anew"
+    robot.run(lambda: any(told in status.message for d in diagnostics for status in d.status))
+
+
 @pytest.mark.nightly  # on a loaded machine messages are lost, and with them what it waits for
 def test_gaps_and_stamps_that_repeat_or_go_back_are_counted_and_it_begins_anew(ros):
     _, slip, diagnostics, robot = start(ros)

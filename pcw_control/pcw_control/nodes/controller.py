@@ -399,7 +399,8 @@ class ControllerNode(RobustLifecycleNode):
         elif silence:
             level, message = WARN, f"{silence}; the torque is zero"
         else:
-            following = "a trajectory" if self._trajectory is not None else "cmd_vel" if self._driving else "nothing"
+            wanted = "cmd_vel" if self._twist is not None else "ft_sensor/wrench"
+            following = "a trajectory" if self._trajectory is not None else wanted if self._driving else "nothing"
             level, message = OK, f"following {following}"
         return Status(
             level, message,

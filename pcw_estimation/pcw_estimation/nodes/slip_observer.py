@@ -89,6 +89,9 @@ class SlipObserverNode(Node):
             return
         if dt is None:
             self._state, self._estimate = self._observer.initial_state(), None
+            if self._watch.last_gap:
+                allowed = f"at most longest_gap = {self._watch.longest_gap:g} s"
+                self._problems.add(f"joint_states: none for {self._watch.last_gap:.3g} s; allowed: {allowed}; it begins anew")
         try:
             position, velocity, effort = self._joints.read(message)
             # The first reading has nothing before it, and its dt means nothing.
