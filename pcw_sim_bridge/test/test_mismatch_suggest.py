@@ -45,7 +45,7 @@ def effect(**entry: object) -> EffectInstance:
 
 # Small enough that jumping about leaves it open what it is.
 RESISTANCE = effect(name="rolling_resistance", target=ALL, arm=5e-4)
-FAINT = effect(name="rolling_resistance", target=ALL, arm=1.5e-4)
+FAINT = effect(name="rolling_resistance", target=ALL, arm=1.2e-4)
 FRICTION_INSTEAD = Doubt(RESISTANCE, "drive_coulomb_friction", THESIS.caster_names)
 
 

@@ -452,6 +452,11 @@ def _far_off(number: RetunedFinding) -> str:
         return f"{far} off: torques act {late} than joint_states report them. The fit allows for it."
     if number.name == "clock_offset":
         return f"{far} off: the force acts {late} than it is recorded, by the motor or by a filter. The fit allows for it."
+    if number.name == "contact.mu_p":
+        return (
+            f"{far} off: slips bend otherwise with forces than described. That is the friction only if the curve has the "
+            "described shape: where wheels use most of their friction nothing is judged."
+        )
     if number.name == "heading_lead":
         return f"{far} off: wheels follow their headings {late} than rigid ones do. The fit allows for it."
     return f"{far} from the description: check it or its tolerance."
