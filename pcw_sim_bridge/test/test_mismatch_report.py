@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from pcw_sim_bridge.mismatch import report, report_figures
+from pcw_sim_bridge.mismatch.analysis import _far_off
 from pcw_sim_bridge.mismatch.errors import MismatchError
 from pcw_sim_bridge.mismatch.findings import (
     REFUSED,
@@ -907,3 +908,11 @@ def test_browser_test_can_fail(tmp_path: Path) -> None:
     _, log, requests = open_in_chromium(page, tmp_path)
     assert [line for line in log.splitlines() if "CONSOLE" in line and "complaint" in line]
     assert [r["url"] for r in requests if r["url"].startswith("http://127.0.0.1:9/")]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("chassis.mass", "check it or its tolerance"), ("contact.mu_p", "only if the curve")]
+)
+def test_what_a_number_far_off_means_is_said(name: str, says: str) -> None:
+    """Friction is judged where wheels use little of it: that of healthy robots was to be "checked" as a mass is."""
+    assert says in _far_off(RetunedFinding(name, "1", 1.0, 0.6, 0.5, 0.7, 0.1))
