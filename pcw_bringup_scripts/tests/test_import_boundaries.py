@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import graphlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path, PurePosixPath
@@ -145,8 +146,8 @@ def module_name(package: str, path: str) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def test_no_modules_import_each_other_in_a_circle():
-    """Imports inside a function and imports for types alone count too: they are arrows as well."""
+def arrows_between_modules() -> dict[str, set[str]]:
+    """What every module imports. Imports inside a function and imports for types alone count too: they are arrows as well."""
     modules = {module_name(package, path): (package, path) for package, path in source_files()}
     arrows = {}
     for name, (package, path) in modules.items():
@@ -154,7 +155,24 @@ def test_no_modules_import_each_other_in_a_circle():
         used = imported_modules(tree, package, PurePosixPath(path)) & set(modules)
         # `from . import x` names the package that x is in; the package's own __init__ is not what is meant.
         arrows[name] = {other for other in used if other != name and not name.startswith(f"{other}.")}
-    graphlib.TopologicalSorter(arrows).prepare()  # raises CycleError, which names the circle
+    return arrows
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    graphlib.TopologicalSorter(arrows_between_modules()).prepare()  # raises CycleError, which names the circle
+
+
+def test_folders_of_the_analyser_import_only_those_before_them_in_its_guide():
+    inside = "pcw_sim_bridge.mismatch."
+    guide = (REPOSITORY / "pcw_sim_bridge" / "docs" / "mismatch.md").read_text(encoding="utf-8")
+    folders = re.findall(r"^\| `(\w+)` \| ", guide.partition("## Where it is in the source")[2], re.MULTILINE)
+    paths = [path.split("/") for _, path in source_files()]
+    assert set(folders) == {path[1] for path in paths if path[0] == "mismatch" and len(path) > 2}
+    for name, used in arrows_between_modules().items():
+        own = name.removeprefix(inside).partition(".")[0]
+        if own in folders and name.startswith(inside):
+            others = {other.removeprefix(inside).partition(".")[0] for other in used if other.startswith(inside)}
+            assert others & set(folders) <= set(folders[: folders.index(own) + 1]), name
 
 
 @pytest.mark.parametrize(

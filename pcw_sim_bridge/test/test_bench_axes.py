@@ -12,12 +12,12 @@ import pytest
 from pcw_description.axis_recording import AxisDescription, load_axis_description
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
-from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
-from pcw_sim_bridge.mismatch.bench_cases import BenchCase, draw_bench_case
+from pcw_sim_bridge.mismatch.axis.axis_channels import AxisProblemBuilder
+from pcw_sim_bridge.mismatch.axis.bench_cases import BenchCase, draw_bench_case
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.explanation import Explanation, explain
-from pcw_sim_bridge.mismatch.findings import Findings
+from pcw_sim_bridge.mismatch.findings.explanation import Explanation, explain
+from pcw_sim_bridge.mismatch.findings.findings import Findings
+from pcw_sim_bridge.mismatch.subjects.axis_subject import AxisSubject
 
 VISCOUS, COULOMB, LOAD = "drive_viscous_friction", "drive_coulomb_friction", "constant_load"
 LEADING_ORDERS = {7.0, 28.0, 14.0, 12.0}

@@ -12,18 +12,18 @@ from scipy import signal
 from pcw_description.axis_recording import AxisDescription, AxisRecording, Column, parse_axis_description
 from pcw_description.compiled import compiled
 from pcw_description.effect_instance import EffectInstance
-from pcw_sim_bridge.mismatch import open_set
-from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
-from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
+from pcw_sim_bridge.mismatch.axis.axis_channels import AxisProblemBuilder
+from pcw_sim_bridge.mismatch.axis.late_speed import lateness
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.explanation import Explanation, explain, strained_of_the_balance
-from pcw_sim_bridge.mismatch.findings import InputFinding
-from pcw_sim_bridge.mismatch.held_out import HeldOut
-from pcw_sim_bridge.mismatch.late_speed import lateness
-from pcw_sim_bridge.mismatch.proof import Prover
-from pcw_sim_bridge.mismatch.signal_filter import reading_noise_level
-from pcw_sim_bridge.mismatch.subject import Opened
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.findings.explanation import Explanation, explain, strained_of_the_balance
+from pcw_sim_bridge.mismatch.findings.findings import InputFinding
+from pcw_sim_bridge.mismatch.proof.held_out import HeldOut
+from pcw_sim_bridge.mismatch.proof.proof import Prover
+from pcw_sim_bridge.mismatch.regression.signal_filter import reading_noise_level
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search import open_set
+from pcw_sim_bridge.mismatch.subjects.axis_subject import AxisSubject
+from pcw_sim_bridge.mismatch.subjects.subject import Opened
 
 VISCOUS, COULOMB, GEAR = "drive_viscous_friction", "drive_coulomb_friction", "load_dependent_friction"
 INERTIA, MOMENT, RATE, SUBSTEPS = 0.02, 0.6, 200.0, 50

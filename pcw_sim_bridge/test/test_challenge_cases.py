@@ -51,7 +51,7 @@ from pcw_sim_bridge.mismatch.challenge.outside_effects import OUTSIDE_EFFECTS, C
 from pcw_sim_bridge.mismatch.challenge.random_robots import draw_robot
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, SimulatedRecording, World, record, simulate
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.regression_problem import RegressionProblem
+from pcw_sim_bridge.mismatch.regression.regression_problem import RegressionProblem
 from pcw_sim_bridge.stamping import StampingParameters
 
 THESIS = load_robot("thesis")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
-from pcw_sim_bridge.mismatch.noise_model import robust_deviation, white_noise_model
-from pcw_sim_bridge.mismatch.regression_problem import RegressionProblem
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.whitened_regression import WhitenedRegression
+from pcw_sim_bridge.mismatch.regression.noise_model import robust_deviation, white_noise_model
+from pcw_sim_bridge.mismatch.regression.regression_problem import RegressionProblem
+from pcw_sim_bridge.mismatch.regression.whitened_regression import WhitenedRegression
+from pcw_sim_bridge.mismatch.robot.chassis_sway import ChassisSway
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

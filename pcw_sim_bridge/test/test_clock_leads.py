@@ -11,9 +11,9 @@ from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.__main__ import main
-from pcw_sim_bridge.mismatch.clock_leads import FIRST_ORDER, clock_leads
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, wheels_slide
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.robot.clock_leads import FIRST_ORDER, clock_leads
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder, wheels_slide
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 from pcw_sim_bridge.simulated_run import record_run
 

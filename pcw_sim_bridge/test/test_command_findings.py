@@ -10,14 +10,19 @@ from scipy import optimize
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.command_findings import _not_borne_out, command_findings, with_rivals
-from pcw_sim_bridge.mismatch.command_tracking import command_problems
-from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm
-from pcw_sim_bridge.mismatch.findings import REFUSED
-from pcw_sim_bridge.mismatch.held_commands import held_commands
-from pcw_sim_bridge.mismatch.reported_torques import coarse_step, doubtful_reports, told_of, unlikely_factor
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.findings.command_findings import _not_borne_out, command_findings, with_rivals
+from pcw_sim_bridge.mismatch.findings.explanation import Explanation, NamedTerm
+from pcw_sim_bridge.mismatch.findings.findings import REFUSED
+from pcw_sim_bridge.mismatch.readings.held_commands import held_commands
+from pcw_sim_bridge.mismatch.readings.reported_torques import (
+    coarse_step,
+    doubtful_reports,
+    told_of,
+    unlikely_factor,
+)
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.robot.command_tracking import command_problems
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.plants.factory import make_plant
 
 ROBOT = load_robot("dyros_pcv")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.composed_columns import Placed, Turning
+from pcw_sim_bridge.mismatch.regression.composed_columns import Placed, Turning
 
 TIME = np.linspace(0.0, 10.0, 200)
 

@@ -9,8 +9,8 @@ import pytest
 from pcw_description import inverse_kinematics, load_robot
 from pcw_description.recording_series import ImuSeries, JointSeries, OdometrySeries
 from pcw_sim_bridge.mismatch.challenge.simulated_case import SimulatedRecording
-from pcw_sim_bridge.mismatch.explanation import explain
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.findings.explanation import explain
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
 
 mujoco = pytest.importorskip("mujoco")
 

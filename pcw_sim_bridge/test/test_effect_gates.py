@@ -5,15 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.effect_gates import (
+from pcw_sim_bridge.mismatch.regression.regression_problem import UNKNOWN
+from pcw_sim_bridge.mismatch.search.effect_gates import (
     COMMON_FACTOR,
     NOISY_FACTOR,
     NOISY_PART,
     EffectGates,
     _Left,
 )
-from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN
-from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
+from pcw_sim_bridge.mismatch.search.selection_settings import SelectionSettings
 
 CASTERS = ("a", "b", "c")
 

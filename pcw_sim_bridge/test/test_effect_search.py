@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.axis_channels import AxisProblemBuilder
-from pcw_sim_bridge.mismatch.bench_cases import BenchCase, draw_bench_case
-from pcw_sim_bridge.mismatch.explanation import Explanation, explain
-from pcw_sim_bridge.mismatch.open_set import smooth_basis
+from pcw_sim_bridge.mismatch.axis.axis_channels import AxisProblemBuilder
+from pcw_sim_bridge.mismatch.axis.bench_cases import BenchCase, draw_bench_case
+from pcw_sim_bridge.mismatch.findings.explanation import Explanation, explain
+from pcw_sim_bridge.mismatch.search.open_set import smooth_basis
 
 # The main parameter of each effect and how far from the truth it may come out. An error of the torque constant hides behind
 # the tolerance of the inertia (2 % of the inertial force here), hence its width.

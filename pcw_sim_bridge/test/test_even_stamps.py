@@ -8,8 +8,8 @@ import pytest
 
 from pcw_description import load_robot
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.even_stamps import EvenStamps
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.readings.even_stamps import EvenStamps
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 from pcw_sim_bridge.stamping import StampingParameters
 

@@ -12,13 +12,13 @@ from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.first_look import Looked, common_orders, orders, patches, waves, windows
-from pcw_sim_bridge.mismatch.regression_problem import SizedTerm
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.shape_search import shape_interval
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.regression.regression_problem import SizedTerm
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.robot.first_look import Looked, common_orders, orders, patches, waves, windows
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.search.shape_search import shape_interval
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

@@ -9,11 +9,11 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.gathered_terms import gatherings
-from pcw_sim_bridge.mismatch.regression_problem import LinearParameter, Term
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.regression.regression_problem import LinearParameter, Term
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.search.gathered_terms import gatherings
 
 ALL = ("a", "b", "c")
 SIZE = LinearParameter("size", "N m", 0.0, 1.0, 1.0)

@@ -9,8 +9,8 @@ from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.explanation import explain
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.findings.explanation import explain
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
 
 ROBOT = load_robot("thesis")
 STICKS, CREEPS = 1e-4, 0.05  # [rad/s] over which a friction is smoothed

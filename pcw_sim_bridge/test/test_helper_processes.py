@@ -15,8 +15,8 @@ from pcw_description import load_robot, ros_messages
 from pcw_description.errors import RecordingError
 from pcw_description.recording import Recording
 from pcw_description.recording_writer import RecordingWriter
-from pcw_sim_bridge.mismatch import helper_processes
-from pcw_sim_bridge.mismatch.helper_processes import HelperProcesses
+from pcw_sim_bridge.mismatch.report import helper_processes
+from pcw_sim_bridge.mismatch.report.helper_processes import HelperProcesses
 
 THESIS = load_robot("thesis")
 
@@ -137,7 +137,7 @@ def test_a_decoded_recording_is_small(tmp_path: Path) -> None:
 def test_they_end_when_who_began_them_is_killed() -> None:
     program = (
         "import os, time; os.sched_getaffinity = lambda process: {0, 1}\n"
-        "from pcw_sim_bridge.mismatch.helper_processes import HelperProcesses\n"
+        "from pcw_sim_bridge.mismatch.report.helper_processes import HelperProcesses\n"
         "made = HelperProcesses()\n"
         "print(*(helper.process.pid for helper in made._helpers), flush=True)\n"
         "time.sleep(60.0)\n"

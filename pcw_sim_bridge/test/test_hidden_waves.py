@@ -7,8 +7,8 @@ import pytest
 
 from pcw_description import load_robot
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 
 WAVES = "{name: uneven_ground, target: [front_left, front_right, rear_left, rear_right], amplitude: 0.002, direction: 0.7}"

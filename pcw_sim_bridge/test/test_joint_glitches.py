@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_sim_bridge.mismatch.joint_glitches import MOST, glitches, without_glitches
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.readings.joint_glitches import MOST, glitches, without_glitches
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 STEP, COUNT = 0.004, 4000

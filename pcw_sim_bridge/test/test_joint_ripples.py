@@ -11,9 +11,9 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.recording import Recording
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
-from pcw_sim_bridge.mismatch.joint_ripples import _apart, _Band, _ripple, joint_ripples
-from pcw_sim_bridge.mismatch.ripple_sizes import RippleScale
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.robot.joint_ripples import _apart, _Band, _ripple, joint_ripples
+from pcw_sim_bridge.mismatch.robot.ripple_sizes import RippleScale
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 
 RATE, LOWEST, HIGHEST = 150.0, 3.0, 60.0

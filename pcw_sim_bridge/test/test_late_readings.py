@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from pcw_description import load_robot
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.even_stamps import EvenStamps, late_stamps
-from pcw_sim_bridge.mismatch.late_readings import late_turns
+from pcw_sim_bridge.mismatch.readings.even_stamps import EvenStamps, late_stamps
+from pcw_sim_bridge.mismatch.readings.late_readings import late_turns
 from pcw_sim_bridge.simulated_run import record_run
 
 STEP = 0.002

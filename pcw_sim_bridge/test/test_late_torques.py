@@ -9,12 +9,12 @@ from scipy import signal
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.command_findings import CommandFindings, command_findings
-from pcw_sim_bridge.mismatch.command_tracking import command_problems, joints_that_report_commands
-from pcw_sim_bridge.mismatch.explanation import explain
-from pcw_sim_bridge.mismatch.held_commands import held_commands
-from pcw_sim_bridge.mismatch.late_torques import TORQUE_LAG, with_late_torques, without_late_reports
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.findings.command_findings import CommandFindings, command_findings
+from pcw_sim_bridge.mismatch.findings.explanation import explain
+from pcw_sim_bridge.mismatch.findings.late_torques import TORQUE_LAG, with_late_torques, without_late_reports
+from pcw_sim_bridge.mismatch.readings.held_commands import held_commands
+from pcw_sim_bridge.mismatch.robot.command_tracking import command_problems, joints_that_report_commands
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
 
 ROBOT = load_robot("thesis")
 DELAY = 0.008

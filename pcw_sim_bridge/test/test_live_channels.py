@@ -16,13 +16,25 @@ from pcw_control.excitation import make_excitation
 from pcw_description import load_robot, ros_messages
 from pcw_description.recording import Recording
 from pcw_description.recording_files import RawMessage
-from pcw_sim_bridge.mismatch.departure_keeper import DepartureKeeper, KeepParameters
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.live_channels import Level, LiveChannels, LiveParameters, header_stamp, onset
-from pcw_sim_bridge.mismatch.live_rows import RowReader
-from pcw_sim_bridge.mismatch.live_trials import faults, judgements, messages, with_effects, within_tolerance
-from pcw_sim_bridge.mismatch.live_tuning import UNSTEADY, Tuning
-from pcw_sim_bridge.mismatch.message_ring import OVERHEAD, MessageRing
+from pcw_sim_bridge.mismatch.live.departure_keeper import DepartureKeeper, KeepParameters
+from pcw_sim_bridge.mismatch.live.live_channels import (
+    Level,
+    LiveChannels,
+    LiveParameters,
+    header_stamp,
+    onset,
+)
+from pcw_sim_bridge.mismatch.live.live_rows import RowReader
+from pcw_sim_bridge.mismatch.live.live_trials import (
+    faults,
+    judgements,
+    messages,
+    with_effects,
+    within_tolerance,
+)
+from pcw_sim_bridge.mismatch.live.live_tuning import UNSTEADY, Tuning
+from pcw_sim_bridge.mismatch.live.message_ring import OVERHEAD, MessageRing
 
 THESIS = load_robot("thesis")
 PARAMETERS = LiveParameters(learning=10.0)

@@ -10,9 +10,9 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.recording import Recording
 from pcw_description.recording_series import ImuSeries, JointSeries, OdometrySeries
-from pcw_sim_bridge.mismatch.long_recordings import STRETCH, part_of
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.robot.long_recordings import STRETCH, part_of
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")
@@ -92,7 +92,7 @@ def test_none_of_them_is_left_without_readings() -> None:
 
 def test_a_problem_is_made_of_the_stretches_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between them nothing is filled: each is a piece of its own."""
-    monkeypatch.setattr("pcw_sim_bridge.mismatch.long_recordings.STRETCH", 2.0)
+    monkeypatch.setattr("pcw_sim_bridge.mismatch.robot.long_recordings.STRETCH", 2.0)
     record_run(THESIS, lambda time: min(time, 1.0) * np.array([0.3 * np.sin(time), 0.2, 0.4]), 12.0, 1, tmp_path / "run")
     recording = RobotSubject(THESIS).open(tmp_path / "run", "fit", {}).recording
     [part], _ = part_of([recording], "searched", 6.0)

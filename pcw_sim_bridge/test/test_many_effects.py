@@ -12,9 +12,9 @@ from pcw_sim_bridge.mismatch.analysis import (
     doubted_in_a_crowd,
     doubted_in_a_gap,
 )
-from pcw_sim_bridge.mismatch.explanation import NamedTerm
-from pcw_sim_bridge.mismatch.regression_problem import Term
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.findings.explanation import NamedTerm
+from pcw_sim_bridge.mismatch.regression.regression_problem import Term
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
 
 KINDS = ("payload_mass", "payload_offset", "wheel_radius_error", "caster_offset_error", "torque_constant_error")
 

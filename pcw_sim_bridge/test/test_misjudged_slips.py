@@ -13,11 +13,11 @@ from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.noise_model import LEAST_SLIPS, reliability, seen_misjudged
-from pcw_sim_bridge.mismatch.regression_problem import Channel
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.regression.noise_model import LEAST_SLIPS, reliability, seen_misjudged
+from pcw_sim_bridge.mismatch.regression.regression_problem import Channel
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

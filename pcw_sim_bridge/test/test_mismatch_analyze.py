@@ -321,6 +321,6 @@ def test_it_runs_without_ros() -> None:
         "        if name.split('.')[0] in ('rclpy', 'rosidl_runtime_py', 'sensor_msgs', 'std_msgs'):\n"
         "            raise ImportError(name)\n"
         "sys.meta_path.insert(0, Blocked())\n"
-        "import pcw_sim_bridge.mismatch.analysis, pcw_sim_bridge.mismatch.report, pcw_sim_bridge.mismatch.__main__\n"
+        "import pcw_sim_bridge.mismatch.analysis, pcw_sim_bridge.mismatch.report.report, pcw_sim_bridge.mismatch.__main__\n"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

@@ -15,7 +15,6 @@ from pcw_description import load_robot
 from pcw_description.axis_recording import AxisDescription, load_axis_description, parse_axis_description
 from pcw_description.effects.registry import read_physics
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.axis_subject import AxisSubject
 from pcw_sim_bridge.mismatch.baselines import BaselineResult, require_packages, run_baselines
 from pcw_sim_bridge.mismatch.baselines.baseline_result import inverse_error, joined_targets
 from pcw_sim_bridge.mismatch.baselines.candidate_columns import (
@@ -36,7 +35,8 @@ from pcw_sim_bridge.mismatch.baselines.null_table import (
 )
 from pcw_sim_bridge.mismatch.baselines.sparse_regression import by_effects, by_variables, sparse_weights
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.subjects.axis_subject import AxisSubject
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

@@ -18,10 +18,10 @@ import pytest
 from pcw_description import load_robot
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.fleet import FleetResults, FleetRobots, Task, analyse_all, find_tasks
-from pcw_sim_bridge.mismatch.fleet_report import fleet_html, write_fleet_report
-from pcw_sim_bridge.mismatch.fleet_trends import DAY, histories, onset, trend
-from pcw_sim_bridge.mismatch.fleet_workers import LocalWorkers
+from pcw_sim_bridge.mismatch.fleet.fleet import FleetResults, FleetRobots, Task, analyse_all, find_tasks
+from pcw_sim_bridge.mismatch.fleet.fleet_report import fleet_html, write_fleet_report
+from pcw_sim_bridge.mismatch.fleet.fleet_trends import DAY, histories, onset, trend
+from pcw_sim_bridge.mismatch.fleet.fleet_workers import LocalWorkers
 from pcw_sim_bridge.simulated_run import record_run
 
 SLED = """\

@@ -21,8 +21,8 @@ from pcw_description.nodes.node_testing import NodeProcess, RosTest  # noqa: E40
 from pcw_description.nodes.node_tools import SENSOR_STREAM_SOURCE, SETTING_UP, stamp_to_ns  # noqa: E402
 from pcw_description.recording import Recording  # noqa: E402
 from pcw_description.recording_files import RawMessage  # noqa: E402
-from pcw_sim_bridge.mismatch.live_channels import LiveChannels, LiveParameters  # noqa: E402
-from pcw_sim_bridge.mismatch.live_trials import (  # noqa: E402
+from pcw_sim_bridge.mismatch.live.live_channels import LiveChannels, LiveParameters  # noqa: E402
+from pcw_sim_bridge.mismatch.live.live_trials import (  # noqa: E402
     faults,
     judgements,
     messages,

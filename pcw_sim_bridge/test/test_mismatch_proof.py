@@ -16,26 +16,34 @@ from pcw_description.contact.contact_model import tyre_parameters
 from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import get
 from pcw_description.robot_description import thinnest_module_inertia
-from pcw_sim_bridge.mismatch import analysis, held_out, law_models, proof
+from pcw_sim_bridge.mismatch import analysis
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.all_cores import on_all_cores
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
-from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.explanation import Explanation, NamedTerm, explain
-from pcw_sim_bridge.mismatch.findings import LocationFinding, Place
-from pcw_sim_bridge.mismatch.generated_effect import NoSuchKernelError
-from pcw_sim_bridge.mismatch.held_out import HeldOut
-from pcw_sim_bridge.mismatch.load_subject import load_subject
-from pcw_sim_bridge.mismatch.locations import locate, place_of_power, supported
-from pcw_sim_bridge.mismatch.manoeuvres import LONGEST, manoeuvres
-from pcw_sim_bridge.mismatch.open_set import Leftover
-from pcw_sim_bridge.mismatch.paired_errors import PairedErrors, gap_closed, interval
-from pcw_sim_bridge.mismatch.proof import Prover, moves_the_robot, winds_up
-from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, Channel, Nuisance, RegressionProblem, Term
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject, retuned_robot
+from pcw_sim_bridge.mismatch.findings import law_models
+from pcw_sim_bridge.mismatch.findings.explanation import Explanation, NamedTerm, explain
+from pcw_sim_bridge.mismatch.findings.findings import LocationFinding, Place
+from pcw_sim_bridge.mismatch.findings.locations import locate, place_of_power, supported
+from pcw_sim_bridge.mismatch.findings.paired_errors import PairedErrors, gap_closed, interval
+from pcw_sim_bridge.mismatch.laws.generated_effect import NoSuchKernelError
+from pcw_sim_bridge.mismatch.proof import held_out, proof
+from pcw_sim_bridge.mismatch.proof.held_out import HeldOut
+from pcw_sim_bridge.mismatch.proof.manoeuvres import LONGEST, manoeuvres
+from pcw_sim_bridge.mismatch.proof.proof import Prover, moves_the_robot, winds_up
+from pcw_sim_bridge.mismatch.regression.regression_problem import (
+    UNKNOWN,
+    Channel,
+    Nuisance,
+    RegressionProblem,
+    Term,
+)
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.robot.chassis_sway import ChassisSway
 from pcw_sim_bridge.mismatch.rollout import HORIZONS, Windows
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.search.open_set import Leftover
+from pcw_sim_bridge.mismatch.subjects.load_subject import load_subject
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject, retuned_robot
 from pcw_sim_bridge.plants.reduced import ReducedPlant, WindowStarts
 from pcw_sim_bridge.simulated_run import record_run
 

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pcw_sim_bridge.mismatch import report, report_figures
 from pcw_sim_bridge.mismatch.analysis import _far_off
 from pcw_sim_bridge.mismatch.errors import MismatchError
-from pcw_sim_bridge.mismatch.findings import (
+from pcw_sim_bridge.mismatch.findings.findings import (
     REFUSED,
     VERDICTS,
     ChannelFinding,
@@ -36,8 +35,9 @@ from pcw_sim_bridge.mismatch.findings import (
     Trace,
     UnknownFinding,
 )
-from pcw_sim_bridge.mismatch.report import check_output, write_report
-from pcw_sim_bridge.mismatch.report_figures import (
+from pcw_sim_bridge.mismatch.report import report, report_figures
+from pcw_sim_bridge.mismatch.report.report import check_output, write_report
+from pcw_sim_bridge.mismatch.report.report_figures import (
     MOST_TRACES,
     binned,
     envelope,
@@ -45,7 +45,7 @@ from pcw_sim_bridge.mismatch.report_figures import (
     timeline,
     worst_window,
 )
-from pcw_sim_bridge.mismatch.report_maps import binned_rms, draw_maps
+from pcw_sim_bridge.mismatch.report.report_maps import binned_rms, draw_maps
 
 PATCHED = {
     "format": "pcw_robot/1",
@@ -832,7 +832,7 @@ def test_checking_imports_neither_ros_nor_the_drawing_library() -> None:
     code = (
         "import sys; sys.modules['rclpy'] = None\n"
         "from pathlib import Path\n"
-        "from pcw_sim_bridge.mismatch.report import check_output\n"
+        "from pcw_sim_bridge.mismatch.report.report import check_output\n"
         "check_output(Path('never_made'))\n"
         "assert 'matplotlib' not in sys.modules\n"
     )

@@ -14,11 +14,11 @@ from pcw_description import RobotDescription, load_robot
 from pcw_description.column_mapping import ColumnMapping, load_column_mapping
 from pcw_description.import_columns import import_columns
 from pcw_description.robot_description import DRIVE, STEER
-from pcw_sim_bridge.mismatch import rolling_cases
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
-from pcw_sim_bridge.mismatch.robot_motion import base_pose
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.sudden_slip import spinning, sudden_slip
+from pcw_sim_bridge.mismatch.robot import rolling_cases
+from pcw_sim_bridge.mismatch.robot.robot_motion import base_pose
+from pcw_sim_bridge.mismatch.robot.sudden_slip import spinning, sudden_slip
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 
 RECORDINGS = Path(__file__).parents[1] / "config" / "recordings"
 # In the recording with the published numbers: the steering of this robot stands so far from its counter's zero.

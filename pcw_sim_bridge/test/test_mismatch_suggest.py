@@ -17,10 +17,10 @@ from pcw_sim_bridge.mismatch import separating_experiment
 from pcw_sim_bridge.mismatch.__main__ import main
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.commands.suggest import odds, read_effect
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.findings import Findings
-from pcw_sim_bridge.mismatch.report import write_report
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.findings.findings import Findings
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.report.report import write_report
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
 from pcw_sim_bridge.mismatch.separating_experiment import (
     WANTED,
     Doubt,
@@ -31,7 +31,7 @@ from pcw_sim_bridge.mismatch.separating_experiment import (
     simulated_problem,
     trial_excitations,
 )
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

@@ -16,9 +16,9 @@ from pcw_description.robot_file import save_robot
 from pcw_sim_bridge.mismatch.__main__ import main as mismatch
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import draw_deviations, with_deviations
-from pcw_sim_bridge.mismatch.findings import Findings
-from pcw_sim_bridge.mismatch.off_ground import wheels_off_ground
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.findings.findings import Findings
+from pcw_sim_bridge.mismatch.robot.off_ground import wheels_off_ground
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 
 LIFTED = "wheels_off_ground"
@@ -169,6 +169,6 @@ def test_a_robot_that_cannot_be_is_not_proposed(tmp_path: Path, monkeypatch: pyt
     physics = "{name: drive_stribeck_friction, target: [front_left], stribeck: 1.0, stribeck_speed: 0.5}"
     run = recorded(tmp_path / "run", "flow_base", LIFTED, 30, 5, "--physics", physics)
     silenced(monkeypatch, "ground_truth", "imu")
-    monkeypatch.setattr("pcw_sim_bridge.mismatch.robot_subject.wheels_turn_alone", lambda problem: False)
+    monkeypatch.setattr("pcw_sim_bridge.mismatch.subjects.robot_subject.wheels_turn_alone", lambda problem: False)
     found = found_in(run, "flow_base")
     assert found.verdict in ("unexplained", "partly_explained", "explained")

@@ -8,10 +8,17 @@ import math
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.effect_gates import EffectGates
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.explanation import named_terms
-from pcw_sim_bridge.mismatch.outline_search import (
+from pcw_sim_bridge.mismatch.findings.explanation import named_terms
+from pcw_sim_bridge.mismatch.regression.regression_problem import (
+    Channel,
+    LinearParameter,
+    RegressionProblem,
+    Term,
+)
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search.effect_gates import EffectGates
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
+from pcw_sim_bridge.mismatch.search.outline_search import (
     OTHERS,
     OUTLINE,
     Outlines,
@@ -19,10 +26,8 @@ from pcw_sim_bridge.mismatch.outline_search import (
     reaching,
     searched_outline,
 )
-from pcw_sim_bridge.mismatch.regression_problem import Channel, LinearParameter, RegressionProblem, Term
-from pcw_sim_bridge.mismatch.shape_search import DROP
-from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search.shape_search import DROP
+from pcw_sim_bridge.mismatch.search.shape_trials import ShapeTrials
 
 NOISE = 0.05
 DISC = {"x": 0.05, "y": 0.05, "length": 0.5, "width": 0.5, "yaw": 0.0, "roundness": 1.0}

@@ -10,8 +10,8 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_sim_bridge.mismatch.__main__ import main
-from pcw_sim_bridge.mismatch.shape_slopes import ShapeSlope
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search.shape_slopes import ShapeSlope
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pcw_sim_bridge.mismatch.generated_effect import generate
-from pcw_sim_bridge.mismatch.place_waves import Waves, place_waves
+from pcw_sim_bridge.mismatch.laws.generated_effect import generate
+from pcw_sim_bridge.mismatch.laws.place_waves import Waves, place_waves
 
 K = 7.5  # [rad/m]
 

@@ -9,7 +9,7 @@ import pytest
 
 from pcw_description import load_robot
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 
 

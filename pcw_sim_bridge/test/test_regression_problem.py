@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from pcw_sim_bridge.mismatch.evidence_selection import BELOW_DETAILS, EffectSearch, Selection
-from pcw_sim_bridge.mismatch.explanation import _telling, explain, named_terms, search_effects
-from pcw_sim_bridge.mismatch.findings import FLAG_PROBABILITY
-from pcw_sim_bridge.mismatch.held_out import HeldOut
-from pcw_sim_bridge.mismatch.nearest_effect import with_the_nearest
-from pcw_sim_bridge.mismatch.noise_model import NoiseModel, channel_deviations
-from pcw_sim_bridge.mismatch.open_set import SHARED_BELIEF, overshadowed_beliefs, shared_beliefs
-from pcw_sim_bridge.mismatch.proof import Prover
-from pcw_sim_bridge.mismatch.regression_problem import (
+from pcw_sim_bridge.mismatch.findings.explanation import _telling, explain, named_terms, search_effects
+from pcw_sim_bridge.mismatch.findings.findings import FLAG_PROBABILITY
+from pcw_sim_bridge.mismatch.findings.nearest_effect import with_the_nearest
+from pcw_sim_bridge.mismatch.proof.held_out import HeldOut
+from pcw_sim_bridge.mismatch.proof.proof import Prover
+from pcw_sim_bridge.mismatch.regression.noise_model import NoiseModel, channel_deviations
+from pcw_sim_bridge.mismatch.regression.regression_problem import (
     UNKNOWN,
     Channel,
     LinearParameter,
@@ -28,10 +26,12 @@ from pcw_sim_bridge.mismatch.regression_problem import (
     SizedTerm,
     Term,
 )
-from pcw_sim_bridge.mismatch.selection_settings import SelectionSettings
-from pcw_sim_bridge.mismatch.shape_search import refined_shape, shape_interval
-from pcw_sim_bridge.mismatch.shape_trials import ShapeTrials
-from pcw_sim_bridge.mismatch.whitened_regression import Instance, WhitenedRegression, _solve
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance, WhitenedRegression, _solve
+from pcw_sim_bridge.mismatch.search.evidence_selection import BELOW_DETAILS, EffectSearch, Selection
+from pcw_sim_bridge.mismatch.search.open_set import SHARED_BELIEF, overshadowed_beliefs, shared_beliefs
+from pcw_sim_bridge.mismatch.search.selection_settings import SelectionSettings
+from pcw_sim_bridge.mismatch.search.shape_search import refined_shape, shape_interval
+from pcw_sim_bridge.mismatch.search.shape_trials import ShapeTrials
 
 SAMPLES, RATE = 600, 50.0
 NOISE = 0.01

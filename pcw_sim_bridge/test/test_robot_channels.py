@@ -18,12 +18,18 @@ from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_description.robot_description import AXIS_NAMES, DRIVE, STEER
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.chassis_sway import ChassisSway
-from pcw_sim_bridge.mismatch.evidence_selection import EffectSearch
-from pcw_sim_bridge.mismatch.regression_problem import SizedTerm, term_key
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder, disturbed, sliding, used_friction
-from pcw_sim_bridge.mismatch.robot_nuisances import varied_numbers
-from pcw_sim_bridge.mismatch.rolling_model import (
+from pcw_sim_bridge.mismatch.regression.regression_problem import SizedTerm, term_key
+from pcw_sim_bridge.mismatch.regression.slow_drifts import beside, drifting_columns
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.robot.chassis_sway import ChassisSway
+from pcw_sim_bridge.mismatch.robot.robot_channels import (
+    RobotProblemBuilder,
+    disturbed,
+    sliding,
+    used_friction,
+)
+from pcw_sim_bridge.mismatch.robot.robot_nuisances import varied_numbers
+from pcw_sim_bridge.mismatch.robot.rolling_model import (
     ChannelLayout,
     ModelNumbers,
     Surroundings,
@@ -32,8 +38,7 @@ from pcw_sim_bridge.mismatch.rolling_model import (
     slips,
     wheel_motion,
 )
-from pcw_sim_bridge.mismatch.slow_drifts import beside, drifting_columns
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search.evidence_selection import EffectSearch
 from pcw_sim_bridge.simulated_run import record_run
 from pcw_sim_bridge.stamping import HEALTHY
 

@@ -14,10 +14,10 @@ from pcw_description.robot_description import AXIS_NAMES
 from pcw_sim_bridge.mismatch.analysis import analyse
 from pcw_sim_bridge.mismatch.challenge.healthy_deviations import with_deviations
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_effects import _flank, _lagging, torque_along
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.robot_terms import LARGEST_TWIST
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot.robot_effects import _flank, _lagging, torque_along
+from pcw_sim_bridge.mismatch.robot.robot_terms import LARGEST_TWIST
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS, DYROS = load_robot("thesis"), load_robot("dyros_pcv")

@@ -14,16 +14,16 @@ import pytest
 from pcw_control.excitation import make_excitation
 from pcw_description import load_robot
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.robot_effects import with_pose
-from pcw_sim_bridge.mismatch.robot_motion import (
+from pcw_sim_bridge.mismatch.regression.signal_filter import interpolated, uniform_segments
+from pcw_sim_bridge.mismatch.robot.robot_effects import with_pose
+from pcw_sim_bridge.mismatch.robot.robot_motion import (
     SMALLEST_CUTOFF,
     choose_cutoff,
     read_motions,
     seldom_read,
     seldom_tracked,
 )
-from pcw_sim_bridge.mismatch.rolling_model import ModelNumbers
-from pcw_sim_bridge.mismatch.signal_filter import interpolated, uniform_segments
+from pcw_sim_bridge.mismatch.robot.rolling_model import ModelNumbers
 from pcw_sim_bridge.simulated_run import record_run
 
 THESIS = load_robot("thesis")

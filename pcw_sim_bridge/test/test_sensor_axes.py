@@ -12,8 +12,8 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.sensor_axes import unlike_axes
+from pcw_sim_bridge.mismatch.robot.sensor_axes import unlike_axes
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 ROBOT = load_robot("thesis")

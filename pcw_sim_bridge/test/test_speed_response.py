@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_sim_bridge.mismatch.speed_response import responses_in_words, speed_responses
+from pcw_sim_bridge.mismatch.robot.speed_response import responses_in_words, speed_responses
 
 THESIS = load_robot("thesis")
 PERIOD, FINE = 0.02, 1e-3  # [s] between messages, and of the integration

@@ -16,12 +16,12 @@ from pcw_description.effects.registry import read_physics
 from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, STEER, RobotDescription
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.findings import Findings
-from pcw_sim_bridge.mismatch.held_commands import expected, held_commands, quiet_torque
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.signal_filter import SignalFilter
-from pcw_sim_bridge.mismatch.torque_errors import FORCES, INSTRUMENTS
+from pcw_sim_bridge.mismatch.findings.findings import Findings
+from pcw_sim_bridge.mismatch.readings.held_commands import expected, held_commands, quiet_torque
+from pcw_sim_bridge.mismatch.regression.signal_filter import SignalFilter
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot.torque_errors import FORCES, INSTRUMENTS
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulated_run import record_run
 
 # Its steering has a lever of 20 mm: a little torque is a large force, and its drives hold speeds.

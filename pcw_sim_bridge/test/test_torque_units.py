@@ -9,12 +9,12 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.effect_instance import EffectInstance
 from pcw_sim_bridge.mismatch.challenge.simulated_case import Run, World, simulate
-from pcw_sim_bridge.mismatch.findings import InputFinding
-from pcw_sim_bridge.mismatch.regression_problem import term_key
-from pcw_sim_bridge.mismatch.robot_channels import RobotProblemBuilder
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.subject import Opened
-from pcw_sim_bridge.mismatch.torque_units import FRICTIONS, torque_units
+from pcw_sim_bridge.mismatch.findings.findings import InputFinding
+from pcw_sim_bridge.mismatch.regression.regression_problem import term_key
+from pcw_sim_bridge.mismatch.robot.robot_channels import RobotProblemBuilder
+from pcw_sim_bridge.mismatch.robot.torque_units import FRICTIONS, torque_units
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.subjects.subject import Opened
 
 THESIS, TIDYBOT = load_robot("thesis"), load_robot("tidybot2")
 

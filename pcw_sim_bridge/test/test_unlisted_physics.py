@@ -31,19 +31,25 @@ from pcw_description.effects.kinds import (
     JointTorqueEffect,
 )
 from pcw_sim_bridge import simulated_run
-from pcw_sim_bridge.mismatch import explanation, open_set
 from pcw_sim_bridge.mismatch.analysis import Analysis, analyse
 from pcw_sim_bridge.mismatch.challenge.outside_effects import OUTSIDE_EFFECTS
-from pcw_sim_bridge.mismatch.explanation import Estimate, NamedTerm
-from pcw_sim_bridge.mismatch.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
-from pcw_sim_bridge.mismatch.law_search import _Screened
-from pcw_sim_bridge.mismatch.leftover_expression import closed_form, fourier, plain_expression, plain_forms
-from pcw_sim_bridge.mismatch.regression_problem import UNKNOWN, LinearParameter, Sites, Term
-from pcw_sim_bridge.mismatch.report import write_report
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
+from pcw_sim_bridge.mismatch.findings import explanation
+from pcw_sim_bridge.mismatch.findings.explanation import Estimate, NamedTerm
+from pcw_sim_bridge.mismatch.laws.generated_effect import ROWS, GeneratedEffect, NoSuchKernelError, generate
+from pcw_sim_bridge.mismatch.laws.leftover_expression import (
+    closed_form,
+    fourier,
+    plain_expression,
+    plain_forms,
+)
+from pcw_sim_bridge.mismatch.laws.unknown_law import Basis, Factor, Law, Place, hypotheses
+from pcw_sim_bridge.mismatch.regression.regression_problem import UNKNOWN, LinearParameter, Sites, Term
+from pcw_sim_bridge.mismatch.regression.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.report.report import write_report
 from pcw_sim_bridge.mismatch.rollout import HORIZONS
-from pcw_sim_bridge.mismatch.unknown_law import Basis, Factor, Law, Place, hypotheses
-from pcw_sim_bridge.mismatch.whitened_regression import Instance
+from pcw_sim_bridge.mismatch.search import open_set
+from pcw_sim_bridge.mismatch.search.law_search import _Screened
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.plants.factory import make_plant
 from pcw_sim_bridge.plants.plant import Plant, PlantState
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcw_description import load_robot
-from pcw_sim_bridge.mismatch.signal_filter import SignalFilter, derivative
-from pcw_sim_bridge.mismatch.unresolved_motion import resolution, unresolved_rate
+from pcw_sim_bridge.mismatch.readings.unresolved_motion import resolution, unresolved_rate
+from pcw_sim_bridge.mismatch.regression.signal_filter import SignalFilter, derivative
 
 RATE, CUTOFF, STEP = 500.0, 3.0, 1e-3
 

@@ -10,7 +10,7 @@ import pytest
 from pcw_description import load_robot
 from pcw_description.recording import Recording
 from pcw_description.robot_description import DRIVE, STEER
-from pcw_sim_bridge.mismatch.wheel_agreement import contradictions
+from pcw_sim_bridge.mismatch.robot.wheel_agreement import contradictions
 from pcw_sim_bridge.simulated_run import record_run
 
 ROBOT = load_robot("thesis")

@@ -5,9 +5,9 @@ import pytest
 
 from pcw_description import load_robot
 from pcw_sim_bridge.mismatch.analysis import analyse
-from pcw_sim_bridge.mismatch.robot_subject import RobotSubject
-from pcw_sim_bridge.mismatch.signal_filter import SignalFilter
-from pcw_sim_bridge.mismatch.wheel_shaking import wheel_shaking
+from pcw_sim_bridge.mismatch.regression.signal_filter import SignalFilter
+from pcw_sim_bridge.mismatch.robot.wheel_shaking import wheel_shaking
+from pcw_sim_bridge.mismatch.subjects.robot_subject import RobotSubject
 from pcw_sim_bridge.simulate import main as simulate
 
 ROBOT = load_robot("thesis")

@@ -15,8 +15,8 @@ from pcw_description.effect_instance import EffectInstance
 from pcw_description.effects.registry import all_effects, also_known, get
 
 from .all_cores import side_by_side
-from .command_findings import CommandFindings, command_findings
-from .explanation import (
+from .findings.command_findings import CommandFindings, command_findings
+from .findings.explanation import (
     OF_ROLLING,
     OF_THE_BALANCE,
     Explanation,
@@ -27,7 +27,7 @@ from .explanation import (
     explanation_instead,
     strained_of_the_balance,
 )
-from .findings import (
+from .findings.findings import (
     FLAG_PROBABILITY,
     ChannelFinding,
     EffectFinding,
@@ -39,21 +39,21 @@ from .findings import (
     Trace,
     UnknownFinding,
 )
-from .generated_effect import NoSuchKernelError, generate
-from .late_torques import TORQUE_LAG, with_late_torques, without_late_reports
-from .locations import locate, locate_leftover, walked
-from .nearest_effect import with_the_nearest
-from .open_set import Leftover
-from .proof import Proof, Prover, with_channels
-from .regression_problem import HEALTHY, STRAINED, TAKEN_OVER, FloatArray, RegressionProblem
-from .ripple_findings import beside_ripples, ripple_findings, with_ripples
-from .selection_settings import SelectionSettings
-from .set_growth import LadderStep
-from .subject import Subject
-from .turned_findings import instance_of, turned_findings
-from .turned_steering import FIGHTING
-from .unknown_law import Law
-from .whitened_regression import Fit, predicted
+from .findings.late_torques import TORQUE_LAG, with_late_torques, without_late_reports
+from .findings.locations import locate, locate_leftover, walked
+from .findings.nearest_effect import with_the_nearest
+from .findings.ripple_findings import beside_ripples, ripple_findings, with_ripples
+from .laws.generated_effect import NoSuchKernelError, generate
+from .laws.unknown_law import Law
+from .proof.proof import Proof, Prover, with_channels
+from .regression.regression_problem import HEALTHY, STRAINED, TAKEN_OVER, FloatArray, RegressionProblem
+from .regression.whitened_regression import Fit, predicted
+from .robot.turned_steering import FIGHTING
+from .search.open_set import Leftover
+from .search.selection_settings import SelectionSettings
+from .search.set_growth import LadderStep
+from .subjects.subject import Subject
+from .subjects.turned_findings import instance_of, turned_findings
 
 Progress = Callable[[str], None]
 

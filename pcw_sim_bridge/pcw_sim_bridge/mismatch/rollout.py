@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .regression_problem import BoolArray, FloatArray, IntArray
+from .regression.regression_problem import BoolArray, FloatArray, IntArray
 
 HORIZONS = (0.1, 0.5, 2.0)  # [s]
 MAIN_HORIZON = 1  # the one by which a patch is judged: most of the effects show in it, and chance does not yet

@@ -36,9 +36,9 @@ from pcw_description.robot_description import ImuDescription, RobotDescription, 
 from ..simulated_run import record_run
 from .analysis import LEAST_DURATION
 from .errors import MismatchError
-from .noise_model import NoiseModel, fit_noise_model
-from .regression_problem import FloatArray, RegressionProblem, Shape, Term
-from .robot_subject import RobotSubject
+from .regression.noise_model import NoiseModel, fit_noise_model
+from .regression.regression_problem import FloatArray, RegressionProblem, Shape, Term
+from .subjects.robot_subject import RobotSubject
 
 # Evidence to plan for [nats]. The analyser calls sets within 3 nats look-alikes, and the evidence that one recording gives
 # scatters by sqrt(2 times its expectation): of 15 nats expected, 99 of 100 recordings give more than 3.

@@ -9,8 +9,8 @@ from sensor_msgs.msg import JointState
 from pcw_description.nodes.diagnostics import ERROR, OK, WARN, Status
 from pcw_description.nodes.node_tools import ns_to_stamp
 
-from ..mismatch.live_channels import ChannelState, Judgement, Level
-from ..mismatch.live_rows import NANOSECONDS
+from ..mismatch.live.live_channels import ChannelState, Judgement, Level
+from ..mismatch.live.live_rows import NANOSECONDS
 
 LEVELS = {Level.OK: OK, Level.WARN: WARN, Level.ERROR: ERROR}
 

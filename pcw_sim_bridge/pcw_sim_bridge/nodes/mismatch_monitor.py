@@ -22,11 +22,11 @@ from pcw_description.nodes.diagnostics import OK, WARN, Diagnostics, Problems, S
 from pcw_description.nodes.node_tools import SENSOR_SOURCE, SENSOR_STREAM, all_declared, declare, run_node
 from pcw_description.ros_messages import IMU, JOINT_STATE, ODOMETRY, TWIST_STAMPED
 
-from ..mismatch.departure_keeper import RANGES as KEEP_RANGES
-from ..mismatch.departure_keeper import DepartureKeeper, KeepParameters
-from ..mismatch.live_channels import RANGES as LIVE_RANGES
-from ..mismatch.live_channels import Judgement, Level, LiveChannels, LiveParameters
-from ..mismatch.live_tuning import Tuning
+from ..mismatch.live.departure_keeper import RANGES as KEEP_RANGES
+from ..mismatch.live.departure_keeper import DepartureKeeper, KeepParameters
+from ..mismatch.live.live_channels import RANGES as LIVE_RANGES
+from ..mismatch.live.live_channels import Judgement, Level, LiveChannels, LiveParameters
+from ..mismatch.live.live_tuning import Tuning
 from .mismatch_messages import LEVELS, channel_statuses, departure_text, mismatch_message
 
 # Topic -> message class, its name, and whether the channels are computed from it; the others are only kept.

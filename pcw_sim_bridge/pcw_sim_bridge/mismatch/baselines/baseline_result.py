@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..regression_problem import BoolArray, FloatArray, RegressionProblem
+from ..regression.regression_problem import BoolArray, FloatArray, RegressionProblem
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..regression_problem import FloatArray, RegressionProblem, Shape, Term, segment_slices
+from ..regression.regression_problem import FloatArray, RegressionProblem, Shape, Term, segment_slices
 
 # Over this part of its largest value a rate changes sign: the variables have passed the channels' filter.
 SIGN_WIDTH = 0.02

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..regression_problem import BoolArray, FloatArray, RegressionProblem
+from ..regression.regression_problem import BoolArray, FloatArray, RegressionProblem
 from .baseline_result import Explained
 from .candidate_columns import features
 from .comparison_packages import comparison_module

@@ -11,9 +11,9 @@ import numpy as np
 from pcw_description.axis_recording import TARGET, AxisDescription, AxisRecording
 from pcw_description.effects.registry import read_physics
 
-from ..axis_channels import AxisProblemBuilder
+from ..axis.axis_channels import AxisProblemBuilder
 from ..errors import MismatchError
-from ..regression_problem import RegressionProblem
+from ..regression.regression_problem import RegressionProblem
 from .baseline_result import Explained
 from .mujoco_identification import AXIS_WINDOWS, WINDOW, FreeNumber, Window, identify, spread_out
 

@@ -20,10 +20,10 @@ from pcw_description.robot_description import AXIS_NAMES, STEER, Caster, RobotDe
 
 from ...plants.true_robot import as_it_really_is
 from ..errors import MismatchError
-from ..regression_problem import FloatArray, RegressionProblem
-from ..robot_channels import RobotProblemBuilder
-from ..robot_motion import RobotMotion
-from ..rolling_model import twists
+from ..regression.regression_problem import FloatArray, RegressionProblem
+from ..robot.robot_channels import RobotProblemBuilder
+from ..robot.robot_motion import RobotMotion
+from ..robot.rolling_model import twists
 from .baseline_result import Explained, joined_targets
 from .candidate_columns import number_as_effect
 from .comparison_packages import comparison_module

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import MismatchError
-from ..regression_problem import FloatArray
+from ..regression.regression_problem import FloatArray
 from .comparison_packages import comparison_module
 
 # Iterations of Gauss-Newton that the time is planned for; the residual falls little after the first few.

@@ -27,7 +27,7 @@ from pcw_description.robot_file import load_robot
 
 from ...simulated_run import record_run
 from ..analysis import analyse
-from ..robot_subject import RobotSubject
+from ..subjects.robot_subject import RobotSubject
 from .baseline_result import BaselineResult
 from .comparison_packages import require_packages
 from .identified_robot import free_numbers, with_numbers

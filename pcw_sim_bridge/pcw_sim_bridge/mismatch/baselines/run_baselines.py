@@ -10,10 +10,10 @@ from pcw_description.axis_recording import AxisDescription
 from pcw_description.errors import PcwError
 from pcw_description.robot_description import RobotDescription
 
-from ..axis_subject import AxisSubject
-from ..regression_problem import RegressionProblem
-from ..robot_subject import RobotSubject
-from ..subject import Subject
+from ..regression.regression_problem import RegressionProblem
+from ..subjects.axis_subject import AxisSubject
+from ..subjects.robot_subject import RobotSubject
+from ..subjects.subject import Subject
 from .baseline_result import BaselineResult, Explained, gap_closed, inverse_error
 from .comparison_packages import require_packages
 from .gradient_boosting import boosted

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..regression_problem import FloatArray, IntArray, RegressionProblem, contiguous_blocks
+from ..regression.regression_problem import FloatArray, IntArray, RegressionProblem, contiguous_blocks
 from .baseline_result import Explained, joined_targets, rms
 from .candidate_columns import column_in, effect_columns, variable_columns
 from .comparison_packages import comparison_module

@@ -18,8 +18,8 @@ from pcw_description.effects.kinds import ActuatorEffect
 from pcw_description.effects.registry import all_effects
 from pcw_description.robot_description import RobotDescription
 
-from ..command_tracking import command_problems
-from ..regression_problem import FloatArray, RegressionProblem
+from ..regression.regression_problem import FloatArray, RegressionProblem
+from ..robot.command_tracking import command_problems
 from .simulated_case import SimulatedRecording
 
 LEAST_NOISE = 1e-9  # [N m]

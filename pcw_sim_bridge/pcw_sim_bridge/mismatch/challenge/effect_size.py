@@ -32,9 +32,9 @@ from pcw_description.effects.registry import all_effects
 from pcw_description.robot_description import STEER, RobotDescription
 
 from ..errors import MismatchError
-from ..noise_model import fit_noise_model, huber_weights
-from ..regression_problem import BoolArray, FloatArray, RegressionProblem
-from ..robot_channels import RobotProblemBuilder
+from ..regression.noise_model import fit_noise_model, huber_weights
+from ..regression.regression_problem import BoolArray, FloatArray, RegressionProblem
+from ..robot.robot_channels import RobotProblemBuilder
 from .command_size import command_size, shows_in_commands
 from .healthy_deviations import tolerated_cost
 from .simulated_case import SimulatedRecording, known_while_simulated

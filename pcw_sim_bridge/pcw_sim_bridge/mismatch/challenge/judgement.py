@@ -10,7 +10,7 @@ from typing import Any
 
 from pcw_description.effects.registry import all_effects
 
-from ..outline_search import OUTLINE, upright
+from ..search.outline_search import OUTLINE, upright
 from .cases import LEAST_SIZE, Answer, is_of_the_floor
 from .healthy_deviations import numbers_moved
 from .outside_effects import OUTSIDE_EFFECTS

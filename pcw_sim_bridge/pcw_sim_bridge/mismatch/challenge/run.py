@@ -15,8 +15,8 @@ from pcw_description.robot_file import load_robot
 
 from ..analysis import analyse
 from ..errors import MismatchError
-from ..load_subject import load_subject
-from ..report import report_json
+from ..report.report import report_json
+from ..subjects.load_subject import load_subject
 from .worker_processes import run_tasks
 
 Progress = Callable[[str], None]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import MismatchError
 
 if TYPE_CHECKING:
-    from ..helper_processes import HelperProcesses
+    from ..report.helper_processes import HelperProcesses
 
 
 def add_parser(commands: Any) -> None:
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     """Analyse, write the report, print its path and five lines."""
     from pcw_description.one_heap import one_heap
 
-    from ..helper_processes import HelperProcesses
+    from ..report.helper_processes import HelperProcesses
 
     one_heap()
     topics = remapped_topics(options.topic)
@@ -75,8 +75,8 @@ def _analysed(options: argparse.Namespace, topics: Mapping[str, str], helpers: H
     from pcw_description.one_thread import one_thread
 
     from ..analysis import analyse
-    from ..load_subject import load_subject
-    from ..report import check_output, write_report
+    from ..report.report import check_output, write_report
+    from ..subjects.load_subject import load_subject
 
     one_thread()  # the analysis has its own, see `all_cores`: those of linear algebra would take turns with them, and spin
     gc.freeze()  # what has been imported stays; to look through all of it for garbage at the end takes half a second

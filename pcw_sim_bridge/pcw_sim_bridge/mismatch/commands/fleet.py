@@ -40,10 +40,10 @@ def add_parser(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Analyse what is not done, then write fleet.json and fleet.html and print the sentences."""
-    from ..fleet import FleetResults, FleetRobots, analyse_all, find_tasks
-    from ..fleet_report import write_fleet_report
-    from ..fleet_trends import histories
-    from ..fleet_workers import DaskWorkers, LocalWorkers
+    from ..fleet.fleet import FleetResults, FleetRobots, analyse_all, find_tasks
+    from ..fleet.fleet_report import write_fleet_report
+    from ..fleet.fleet_trends import histories
+    from ..fleet.fleet_workers import DaskWorkers, LocalWorkers
 
     if options.workers is not None and options.workers < 1:
         raise MismatchError(f"--workers {options.workers} is not allowed; allowed: 1 and above")

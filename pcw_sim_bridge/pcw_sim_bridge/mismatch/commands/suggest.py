@@ -50,9 +50,9 @@ def add_parser(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Rank the manoeuvres, say what they would give and write the best one."""
-    from ..load_subject import load_subject
-    from ..robot_subject import RobotSubject
     from ..separating_experiment import find_remedy, rank, trial_excitations
+    from ..subjects.load_subject import load_subject
+    from ..subjects.robot_subject import RobotSubject
 
     if (options.report is None) == (options.between is None):
         raise MismatchError("REPORT_DIR or --between A B is wanted; allowed: one of them")

@@ -1,0 +1,1 @@
+"""A bench axis as the analyser sees it: its channel, and its forward simulation."""

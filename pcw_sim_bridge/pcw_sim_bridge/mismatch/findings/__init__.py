@@ -1,0 +1,1 @@
+"""What is said of a search: effects with numbers, doubts, look-alikes and places."""

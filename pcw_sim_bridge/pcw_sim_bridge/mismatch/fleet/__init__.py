@@ -1,0 +1,1 @@
+"""Many recordings of many robots, and what became of each."""

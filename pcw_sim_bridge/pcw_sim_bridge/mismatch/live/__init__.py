@@ -1,0 +1,1 @@
+"""The channels of a running robot, judged while it drives."""

@@ -1,0 +1,1 @@
+"""The report: a page, a file for programs, the patched description and figures."""

@@ -1,0 +1,1 @@
+"""What can be analysed, a bench axis or a robot, behind one interface."""
