@@ -113,13 +113,16 @@ class FoundGround:
     def with_test(self, caster: int, found: RobotTerrainEstimate) -> FoundGround:
         """Return what is known after the test of a caster."""
         if not found.valid[caster]:
-            said = (*self.said[:caster], found.reason[caster], *self.said[caster + 1 :])
-            return dataclasses.replace(self, said=said)
+            return self.without_test(caster, found.reason[caster])
         at = np.arange(len(self.valid)) == caster
         return dataclasses.replace(
             self, mu_p=np.where(at, found.mu_p, self.mu_p), lambda_p=np.where(at, found.lambda_p, self.lambda_p),
             covariance=np.where(at[:, None, None], found.covariance, self.covariance), valid=self.valid | at,
         )  # fmt: skip
+
+    def without_test(self, caster: int, reason: str) -> FoundGround:
+        """Return what is known after a test of a caster that has told nothing, for a reason."""
+        return dataclasses.replace(self, said=(*self.said[:caster], reason, *self.said[caster + 1 :]))
 
     def interval(self, caster: int) -> tuple[FloatArray, FloatArray]:
         """Return the lower and the upper ends (2,) of the 95 % intervals of mu_p and lambda_p of a caster that is known."""
@@ -336,15 +339,19 @@ class GroundTest:
         if state.replay is not None and testing.phase is Phase.WAIT:
             testing = dataclasses.replace(testing, elapsed=0.0)  # until the ground of the caster before is known
         testing, now = self.active.step(testing, told, dt)
-        instants, replay = state.instants, state.replay
+        instants, replay, ground = state.instants, state.replay, state.ground
         if caster >= 0:
             instants = (*instants, Instant(m, joints.effort.copy(), now.twist.copy(), dt))
             if now.testing != caster:
                 live = self.terrain.initial_state()
-                replay = ActiveRecord(self.terrain, self.active, instants).begin(caster)
+                if testing.refusal is Refusal.SHAKES:  # the mean of what a friction curve gives is not on the curve
+                    instants, ground = (), ground.without_test(caster, testing.refusal.value)
+                else:
+                    replay = ActiveRecord(self.terrain, self.active, instants).begin(caster)
         state = dataclasses.replace(
-            state, testing=testing, live=live, under_test=now.testing, instants=instants, replay=replay, twist=now.twist
-        )
+            state, testing=testing, live=live, ground=ground, under_test=now.testing, instants=instants, replay=replay,
+            twist=now.twist,
+        )  # fmt: skip
         return state, now
 
     def _evaluated(self, state: GroundTestState) -> tuple[GroundTestState, FloatArray, int]:

@@ -107,18 +107,35 @@ def test_the_ground_is_found_with_every_controller_that_it_is_said_to_work_with(
     assert way <= 0.004 and way <= forecast.path
 
 
-@pytest.mark.parametrize("late", [2, *(pytest.param(late, marks=pytest.mark.nightly) for late in (3, 4))])
+@pytest.mark.parametrize("late", [2, 5, *(pytest.param(late, marks=pytest.mark.nightly) for late in (3, 4, 6))])
 def test_torques_may_come_as_late_as_is_said(late):
-    """By 2 ms each; from four on controller, tyres and observer shake each other: the test ends before the path is lost."""
+    """By 2 ms each; from five on the controller alone shakes the robot, and no test begins.
+
+    At four a test itself once shook it: the base was off by 13 mm before another wheel was said to slip.
+    """
     loop = Loop(late=late).under_way()
     loop.request()
     loop.until(lambda: not loop.state.busy)
     ground = loop.state.ground
-    if late > 3:
-        assert loop.state.testing.refusal is Refusal.OTHERS_SLIP and not ground.valid.any()
+    if late > 4:
+        assert loop.state.testing.refusal is Refusal.SHAKES and not ground.valid.any()
     else:
         assert ground.valid.all() and np.abs(ground.mu_p / MU - 1.0).max() < 0.05
-        assert np.abs(ground.lambda_p / CRITICAL - 1.0).max() < (0.03 if late == 2 else 0.2)
+        assert np.abs(ground.lambda_p / CRITICAL - 1.0).max() < (0.03 if late < 4 else 0.1)
+    assert np.hypot(*np.array(loop.errors)[:, :2].T).max() <= 0.005
+
+
+@pytest.mark.parametrize("slip", [0.03, pytest.param(0.2, marks=pytest.mark.nightly)])
+def test_torques_that_begin_to_come_late_end_it_before_the_path_is_lost_and_nothing_is_learned(slip):
+    """By 10 ms, as where a computer gets other work in the middle of a test."""
+    loop = Loop().under_way()
+    loop.request()
+    loop.until(lambda: abs(loop.state.testing.slip) > slip)
+    loop.waiting += 5 * [loop.torque]
+    loop.until(lambda: not loop.state.busy)
+    ground = loop.state.ground
+    assert loop.state.testing.refusal is Refusal.SHAKES and loop.state.testing.tested == (0,)
+    assert not ground.valid.any() and ground.said == (Refusal.SHAKES.value, "", "", "") and loop.state.instants == ()
     assert np.hypot(*np.array(loop.errors)[:, :2].T).max() <= 0.005
 
 

@@ -6,7 +6,8 @@ than the controller asked of it, F_i,ct, and the others take the rest, so that n
 
     min max_j |dF_j| / (mu_p F_N)_j     where     A_others^T dF_others = -a_i (F_i - F_i,ct),     so that A^T dF = 0,
 
-and d_tau = B^T dF.
+and d_tau = B^T dF. F_i counts at once, F_i,ct slowly: it is feedback that the others get besides their own, and by which the
+controller would bear less delay than without a test. Nobody has what it asks of the wheel under test faster than that.
 
 The increment is added to the controller's torque. The controller must not take the slipping wheel for motion: instead of
 the joints that are measured it is given those of wheels that roll (`controller_position`, `controller_velocity`). The others
@@ -20,7 +21,10 @@ and k_p, that loop has the gain k_d L c s / g, which a soft tyre brings to about
 a stiffer one: the robot shakes at 8 Hz. In the positions the shear is only k_p L c / g, a few percent.
 
 Slip grows exponentially, so that a peak is passed equally slowly wherever it lies. It ends where the ground is known, or at
-`greatest_slip`. It does not begin, and ends at once, where it is not safe; see `Refusal` for the reasons.
+`greatest_slip`. It does not begin, and ends at once, where it is not safe; see `Refusal` for the reasons. Torques that come
+too late for the gains shake the wheels to and fro by more and more, and their mean, by which slip of another wheel is told,
+says nothing of it: how far they swing is followed by itself. No wheel is brought back then, as that would be done by the loops
+that shake.
 """
 
 from __future__ import annotations
@@ -36,10 +40,14 @@ from pcw_description.robot_description import DRIVE, STEER, FloatArray, RobotDes
 
 from .errors import TerrainError, require, require_dt
 
+# Up to which what the controller asks of the wheel under test is shared among the others [rad/s].
+SHARE_RATE = 30.0
 # At which the growth of a creep is followed [rad/s].
 CREEP_RATE = 100.0
 # At which slip that no creep explains is followed; differences of encoder angles are rough [rad/s].
 STRAY_RATE = 50.0
+# Above which wheel speeds count as going to and fro, and at which their size is followed [rad/s].
+SHAKE_RATE, SHAKE_MEMORY = 50.0, 20.0
 # Part of a wheel's slip that the twist does not take for motion and by which it is scaled up, at least: noise grows with one
 # over its root, and is no more than doubled [1].
 LEAST_SHARE = 0.25
@@ -77,6 +85,7 @@ class Refusal(enum.Enum):
     OTHERS_NEAR_LIMIT = "the other wheels would come too near their own limit"
     DISTURBANCE = "the base would leave its path too far"
     OTHERS_SLIP = "another wheel slips"
+    SHAKES = "the wheels shake: torques come too late for the controller's gains"
     TOO_LONG = "it took too long"
     CANCELLED = "cancelled"
 
@@ -98,14 +107,15 @@ class ActiveParameters:
         return_time: in which the slip goes back to nothing [s].
         settle_time: for which the wheel is held there until the controller has it again [s].
         rest_time: between two casters [s].
-        wheel_gain: of the wheel's speed loop, as a part of its inertia over dt [1].
+        wheel_gain: of the wheel's speed loop, as a part of its inertia over dt [1]; a wheel that slips shakes where torques
+            come later than about 1.5 dt / wheel_gain, the hold of a cycle included.
         wheel_reset: of the same loop's integral [1/s].
         least_speed, greatest_speed: of the wheel that is to slip [m/s].
         greatest_turn_rate: of the robot [rad/s].
         greatest_steer_rate: of any caster [rad/s].
         assumed_friction: peak that a prediction reckons with where none is given [1].
         others_use: part of their friction, as it is believed to be, up to which others may be loaded [1].
-        others_slip: slip ratio of another wheel at which it ends [1].
+        others_slip: slip ratio of another wheel at which it ends, for good or as a root mean square to and fro [1].
         torque_reserve: part of a motor's torque that may be needed by what is believed, which is known to some percent [1].
         longest: of one caster [s].
         force_error: part of a force that is not compensated, for the prediction of the disturbance [1].
@@ -120,7 +130,7 @@ class ActiveParameters:
     return_time: float = 0.1
     settle_time: float = 0.1
     rest_time: float = 0.05
-    wheel_gain: float = 0.3
+    wheel_gain: float = 0.2
     wheel_reset: float = 20.0
     least_speed: float = 0.12
     greatest_speed: float = 0.8
@@ -189,8 +199,11 @@ class ActiveState:
         elapsed: in this phase [s].
         slip: wanted slip ratio, with its sign [1].
         integral: of the wheel's speed loop [N m].
+        asked: by the controller of the wheel under test, slowly: what the others take over of it [N].
         rolled_ahead: by how much the joints have turned further than wheels that roll would have (n, 2) [rad].
         creep: slip ratios that the forces take, filtered (n, 2) [1].
+        smooth: speeds of the wheels, along and across, without what is fast of them (n, 2) [m/s].
+        swings: mean squares of what is fast, forwards and back (2, n, 2) [m^2/s^2].
         strays: what the common twist leaves of the velocities of the others, creep taken off, filtered (n,) [m/s].
         creep_sums: of slip and of what friction feigns, each times the wanted slip, at the beginning of the test, and the
             relaxed slip (3,).
@@ -205,8 +218,11 @@ class ActiveState:
     elapsed: float
     slip: float
     integral: float
+    asked: float
     rolled_ahead: FloatArray
     creep: FloatArray
+    smooth: FloatArray
+    swings: FloatArray
     strays: FloatArray
     creep_sums: FloatArray
     spent: FloatArray
@@ -226,7 +242,7 @@ class ActiveOutput:
             velocity is not the derivative of the position, see the module's docstring.
         twist: of base_link, from the casters that are not under test, less the slip that their forces take (3,).
         testing: index of the caster under test, or -1.
-        net_wrench: A^T dF, which is nothing but rounding (3,) [N, N, N m].
+        net_wrench: A^T dF, with F_i,ct as slow as the others get it, which is nothing but rounding (3,) [N, N, N m].
         others_use: greatest part of their friction that the others are asked for [1].
     """
 
@@ -289,8 +305,11 @@ class ActiveIdentification:
             0.0,
             0.0,
             0.0,
+            0.0,
             np.zeros((self.n, 2)),
             np.zeros((self.n, 2)),
+            np.zeros((self.n, 2)),
+            np.zeros((2, self.n, 2)),
             np.zeros(self.n),
             np.zeros(3),
             np.zeros(3),
@@ -330,9 +349,7 @@ class ActiveIdentification:
         """
         if state.phase in (Phase.IDLE, Phase.DONE, Phase.REFUSED):
             return state
-        return dataclasses.replace(
-            state, phase=Phase.REFUSED, queue=(), elapsed=0.0, slip=0.0, integral=0.0, refusal=Refusal.CANCELLED
-        )
+        return self._dropped(state, Refusal.CANCELLED)
 
     def reason_against(self, state: ActiveState, measurement: ActiveMeasurement, caster: int) -> Refusal:
         """Return why the test of a caster would not begin now; `Refusal.NONE` where it would.
@@ -396,13 +413,16 @@ class ActiveIdentification:
         steer_angle = np.ascontiguousarray(m.position[:, STEER])
         A = wheel_jacobian_kernel(self.robot.steer_axis, self.robot.caster_offset, steer_angle)
         sensed = np.einsum("nij,nj->ni", self._B, m.velocity)
-        state, steady, shear = self._creep(state, m, sensed, dt)
+        state, steady, shear = self._creep(self._followed(state, sensed, dt), m, sensed, dt)
         busy = state.phase in (Phase.WAIT, Phase.SLIP, Phase.RETURN)
         rolled = sensed - steady if busy else sensed
         moved = rolled - shear if busy else sensed
         testing = state.queue[0] if state.phase in (Phase.SLIP, Phase.RETURN) else -1
         twist = self._twist(A, moved, testing)
         state = dataclasses.replace(state, elapsed=state.elapsed + dt)
+        if testing >= 0 and self._shakes(np.delete(state.swings, testing, axis=1), float(A[2 * testing] @ twist)):
+            # Nothing is brought back by the loops that shake.
+            state, testing = self._dropped(state, Refusal.SHAKES), -1
         if state.phase is Phase.WAIT and (state.refusal is Refusal.CANCELLED or state.elapsed >= p.rest_time):
             state = self._begin(state, m, A, twist)
             testing = state.queue[0] if state.phase is Phase.SLIP else -1
@@ -414,7 +434,7 @@ class ActiveIdentification:
         return self._slip(state, m, A, sensed, rolled, moved, testing, dt)
 
     def _begin(self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> ActiveState:
-        refusal = state.refusal if state.refusal is Refusal.CANCELLED else self._unsafe(state.queue[0], m, A, twist)
+        refusal = state.refusal if state.refusal is Refusal.CANCELLED else self._unsafe(state, m, A, twist)
         before = tuple(entry for entry in state.refused if entry[0] != state.queue[0])
         if refusal in OF_ONE_CASTER:
             refused = (*before, (state.queue[0], refusal))
@@ -438,6 +458,7 @@ class ActiveIdentification:
             elapsed=0.0,
             slip=0.0,
             integral=0.0,
+            asked=self._asked(m, state.queue[0]),
             strays=np.zeros(self.n),
             creep_sums=np.zeros(3),
             backwards=backwards,
@@ -446,9 +467,11 @@ class ActiveIdentification:
             refused=before,
         )
 
-    def _unsafe(self, caster: int, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> Refusal:
-        p = self.parameters
+    def _unsafe(self, state: ActiveState, m: ActiveMeasurement, A: FloatArray, twist: FloatArray) -> Refusal:
+        p, caster = self.parameters, state.queue[0]
         speed = abs(float(A[2 * caster] @ twist))
+        if self._shakes(state.swings, speed):
+            return Refusal.SHAKES
         if speed < p.least_speed:
             return Refusal.TOO_SLOW
         if speed > p.greatest_speed:
@@ -509,8 +532,8 @@ class ActiveIdentification:
         # What the ground takes is given to the wheel at once: past its peak it lets go faster than a loop could follow.
         carried = self.robot.wheel_radius[testing] * float(m.force[testing, 0])
         torque[testing, DRIVE] = gain * error + integral + carried - m.controller_torque[testing, DRIVE]
-        asked = self._B_inverse[testing].T @ m.controller_torque[testing]
-        more = np.array([float(m.force[testing, 0]) - asked[0], 0.0])
+        asked = state.asked - math.expm1(-SHARE_RATE * dt) * (self._asked(m, testing) - state.asked)
+        more = np.array([float(m.force[testing, 0]) - asked, 0.0])
         others = self._others(A, testing, more, m.mu_p * m.normal_force)
         index = np.delete(np.arange(self.n), testing)
         torque[index] = np.einsum("nji,nj->ni", self._B[index], others)
@@ -522,7 +545,7 @@ class ActiveIdentification:
         rolls = np.einsum("nij,nj->ni", self._B_inverse, moved)
         rolls[testing] = self._B_inverse[testing] @ A[2 * testing : 2 * testing + 2] @ twist
         ahead = state.rolled_ahead + (m.velocity - rolls) * dt
-        state = dataclasses.replace(state, integral=integral, rolled_ahead=ahead)
+        state = dataclasses.replace(state, integral=integral, asked=asked, rolled_ahead=ahead)
         output = ActiveOutput(
             torque, self._seen_position(state, m), seen, twist, testing, A.T @ force.ravel(), float(use.max())
         )
@@ -540,6 +563,37 @@ class ActiveIdentification:
     @staticmethod
     def _ended(state: ActiveState, refusal: Refusal) -> ActiveState:
         return dataclasses.replace(state, phase=Phase.RETURN, elapsed=0.0, refusal=refusal)
+
+    @staticmethod
+    def _dropped(state: ActiveState, refusal: Refusal) -> ActiveState:
+        return dataclasses.replace(state, phase=Phase.REFUSED, queue=(), elapsed=0.0, slip=0.0, integral=0.0, refusal=refusal)
+
+    @staticmethod
+    def _followed(state: ActiveState, sensed: FloatArray, dt: float) -> ActiveState:
+        """Return the state with one more reading of how far wheel speeds go to and fro."""
+        smooth = state.smooth - math.expm1(-SHAKE_RATE * dt) * (sensed - state.smooth)
+        fast = sensed - smooth
+        squares = np.maximum([fast, -fast], 0.0) ** 2
+        swings = state.swings - math.expm1(-SHAKE_MEMORY * dt) * (squares - state.swings)
+        return dataclasses.replace(state, smooth=smooth, swings=swings)
+
+    def _shakes(self, swings: FloatArray, speed: float) -> bool:
+        """Return whether one of some wheels goes to and fro by more than a wheel may slip that is not under test.
+
+        Root mean square. The body is too heavy to follow: what wheels do so fast is slip. One that lets go, or grips again,
+        swings one way; so twice the lesser of both mean squares counts, which of what goes to and fro is all of it.
+
+        Args:
+            swings: as in `ActiveState`, of these wheels.
+            speed: of the one that is under test, or would be [m/s].
+        """
+        p = self.parameters
+        size = math.sqrt(2.0 * float(swings.min(axis=0).max()))
+        return size > p.others_slip * max(abs(speed), p.least_speed)
+
+    def _asked(self, m: ActiveMeasurement, caster: int) -> float:
+        """Return the force along its wheel that the controller asks of a caster [N]."""
+        return float((self._B_inverse[caster].T @ m.controller_torque[caster])[DRIVE])
 
     def _others(self, A: FloatArray, caster: int, force: FloatArray, hold: FloatArray) -> FloatArray:
         """Return the forces of the others (n - 1, 2) [N] that leave no wrench with `force` (2,) of a caster.

@@ -278,6 +278,78 @@ def test_it_ends_at_once_when_another_wheel_slips_when_cancelled_and_when_it_tak
     assert state.refusal is Refusal.TOO_LONG
 
 
+def shaken(added, begun=0.1, dt=0.002):
+    """Step a test until it ends, with speeds [m/s] added to those of wheels that roll from a time after the request on."""
+    active, measured = ActiveIdentification(THESIS), steady(THESIS)
+    state = active.initial_state()
+    for cycle in range(round(-0.5 / dt), round(1.5 / dt)):
+        if cycle == 0:
+            state = active.request(state, (0, 1))
+        velocity, late = measured.velocity.copy(), cycle * dt - begun
+        velocity[:, DRIVE] += (added(late) if late > 0.0 else 0.0) / THESIS.wheel_radius
+        state, output = active.step(state, dataclasses.replace(measured, velocity=velocity), dt)
+        if state.phase is Phase.REFUSED or state.tested == (0, 1):
+            break
+    return state, output, late
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.005])
+@pytest.mark.parametrize("frequency", [10.0, 20.0, 38.0, 60.0])
+@pytest.mark.parametrize("wheels", [(1, 1, 1, 1), (1, 0.4, 0.4, 0.4)])
+def test_it_ends_when_wheels_shake_before_it_costs_the_path(wheels, frequency, dt):
+    """Torques 8 ms late once shook all wheels to and fro, whose mean is nothing, and the base was off by 13 mm.
+
+    It grew by a factor of e in three periods, and the base was off by less than 1 mm when the others had come to 0.12 m/s.
+    """
+
+    def size(time):
+        return 0.02 * math.exp(frequency * time / 3.0)
+
+    def added(time):
+        return size(time) * math.sin(2.0 * math.pi * frequency * time) * np.array(wheels)
+
+    state, output, late = shaken(added, dt=dt)
+    assert state.phase is Phase.REFUSED and state.refusal is Refusal.SHAKES and state.tested == (0,)
+    assert output.testing == -1 and not output.torque.any()  # at once: it is the loops that shake
+    assert size(late) * wheels[1] < 0.16
+
+
+def test_it_does_not_begin_while_wheels_shake():
+    """All alike, so that none of them slips against the others."""
+    state, output, _ = shaken(lambda time: np.full(4, 0.1) * math.sin(240.0 * time), begun=-0.5)
+    assert state.phase is Phase.REFUSED and state.refusal is Refusal.SHAKES and not output.torque.any()
+    assert state.tested == () and state.refused == ()  # no matter of one caster
+
+
+@pytest.mark.parametrize(
+    "added",
+    [
+        lambda time: np.full(4, 0.05) * math.sin(240.0 * time),  # less than another wheel may slip
+        lambda time: np.array([0.0, 0.0, 0.0, 0.04]),  # the same, for good
+        lambda time: np.array([0.3 * math.exp(-(((time - 0.3) / 0.1) ** 2)), 0.0, 0.0, 0.0]),  # let go, and brought back
+        lambda time: np.full(4, 0.05) * math.sin(3.0 * time),  # the robot itself
+    ],
+)
+def test_what_is_small_slow_or_one_way_is_no_shaking(added):
+    state, _, _ = shaken(added)
+    assert state.tested == (0, 1) and state.refusal is Refusal.NONE
+
+
+def test_the_others_get_the_feedback_of_the_wheel_under_test_slowly():
+    """At once it was feedback besides their own: the loop bore less delay than without a test, and shook where it was late."""
+    active, measured = ActiveIdentification(THESIS), steady(THESIS)
+    state, before = slipping(active, measured)
+    asking = np.zeros((4, 2))
+    asking[0, DRIVE] = 2.0
+    asked = dataclasses.replace(measured, controller_torque=asking)
+    taken = []
+    for _ in range(100):
+        state, output = active.step(state, asked, 0.002)
+        taken.append(float((output.torque - before.torque)[1:, DRIVE].sum() / 2.0))
+        assert np.abs(output.net_wrench).max() < 1e-9
+    assert taken[0] < 0.1 and taken[-1] == pytest.approx(1.0, abs=0.01)
+
+
 @pytest.mark.parametrize("heading", [pytest.param(0.0, marks=pytest.mark.nightly), 0.9])
 @pytest.mark.parametrize("tested", range(4))
 @pytest.mark.parametrize("fraction", [0.8, -0.8, 1.25, -1.25])
