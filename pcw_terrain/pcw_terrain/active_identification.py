@@ -107,8 +107,9 @@ class ActiveParameters:
         return_time: in which the slip goes back to nothing [s].
         settle_time: for which the wheel is held there until the controller has it again [s].
         rest_time: between two casters [s].
-        wheel_gain: of the wheel's speed loop, as a part of its inertia over dt [1]; a wheel that slips shakes where torques
-            come later than about 1.5 dt / wheel_gain, the hold of a cycle included.
+        wheel_rate: of the wheel's speed loop, gain over inertia [rad/s]; a wheel that slips shakes where torques come later
+            than about 1.5 / wheel_rate.
+        wheel_gain: the same as a part of 1 / dt, at most [1].
         wheel_reset: of the same loop's integral [1/s].
         least_speed, greatest_speed: of the wheel that is to slip [m/s].
         greatest_turn_rate: of the robot [rad/s].
@@ -130,7 +131,8 @@ class ActiveParameters:
     return_time: float = 0.1
     settle_time: float = 0.1
     rest_time: float = 0.05
-    wheel_gain: float = 0.2
+    wheel_rate: float = 100.0
+    wheel_gain: float = 0.3
     wheel_reset: float = 20.0
     least_speed: float = 0.12
     greatest_speed: float = 0.8
@@ -153,7 +155,7 @@ class ActiveParameters:
         """
         require("first_slip", self.first_slip, above=0.0, maximum=0.2)
         require("greatest_slip", self.greatest_slip, above=self.first_slip, maximum=0.8)
-        for name in ("growth", "return_time", "wheel_gain", "least_speed", "assumed_friction", "longest"):
+        for name in ("growth", "return_time", "wheel_rate", "wheel_gain", "least_speed", "assumed_friction", "longest"):
             require(name, getattr(self, name), above=0.0)
         require("greatest_speed", self.greatest_speed, above=self.least_speed)
         require("enough", self.enough, minimum=1.0)
@@ -525,7 +527,7 @@ class ActiveIdentification:
         led = float((self._B_inverse[testing] @ A[2 * testing : 2 * testing + 2] @ guide)[DRIVE])
         wanted = led + (rolling - velocity) / self.robot.wheel_radius[testing]
         error = wanted - m.velocity[testing, DRIVE]
-        gain = p.wheel_gain * self._inertia[testing] / dt
+        gain = min(p.wheel_rate, p.wheel_gain / dt) * self._inertia[testing]
         limit = self.robot.torque_limit[testing, DRIVE]
         integral = float(np.clip(state.integral + gain * p.wheel_reset * error * dt, -limit, limit))
         torque = np.zeros((self.n, 2))
