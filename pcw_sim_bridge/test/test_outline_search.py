@@ -213,6 +213,21 @@ def test_a_border_that_few_wheels_crossed_is_within_its_interval(seed):
         assert low < outline[name] < high, name
 
 
+def test_no_border_is_known_better_than_where_a_tyre_feels_it():
+    """Many crossings told borders to half a millimetre, and another simulator's wheels felt them some millimetres off."""
+    outline = {"x": 0.1, "y": 0.02, "length": 0.66, "width": 0.38, "yaw": 0.7, "roundness": 0.0}
+    problem = floor_problem(tracks(48), outline, 5.0)
+    (term,), blur = problem.terms, {"x": 0.002, "y": 0.002, "length": 0.004, "width": 0.004}
+    for deviations in ({}, blur):
+        problem = dataclasses.replace(problem, terms=(dataclasses.replace(term, blur=deviations),))
+        search = EffectSearch(problem, np.random.default_rng(0))
+        estimates = named_terms(search, search.conclude((shaped(outline),), 5.0))[0].estimates
+        halves = {name: 0.5 * (estimates[name].high - estimates[name].low) for name in blur}
+        for name, half in halves.items():
+            least = 1.96 * deviations.get(name, 0.0)
+            assert least <= half < least + 0.002, name
+
+
 def test_a_patch_is_judged_in_its_own_outline_and_not_in_that_of_a_first_look():
     """A disc in the middle of a strip leaves more beside it than it explains: so a patch of 2800 nats was dropped."""
     strip = {"x": 0.1, "y": 0.0, "length": 1.5, "width": 0.3, "yaw": 0.8, "roundness": 0.0}

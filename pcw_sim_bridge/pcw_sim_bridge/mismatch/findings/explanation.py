@@ -696,11 +696,11 @@ def named_terms(search: EffectSearch, selection: Selection) -> tuple[NamedTerm, 
                 slope, deviation = beside_all[index, name]
                 first, last = slope.interval(instance, HALF_WIDTH * deviation)
                 low, high = min(low, first), max(high, last)
-            blur = HALF_WIDTH * term.blur.get(name, 0.0)
-            low, high = value - math.hypot(value - low, blur), value + math.hypot(high - value, blur)
             estimates[name] = Estimate(value, "", low, high)
         if instance.term in search.outlines:
             estimates = _as_wide(estimates, term, instance, search.outlines[instance.term], DROP * wider)
+        for name, deviation in term.blur.items():
+            estimates[name] = _blurred(estimates[name], HALF_WIDTH * deviation)
         columns = problem.columns(instance.term, instance.shape)[..., list(instance.active)]
         contribution = columns @ fit.mean[position : position + active]
         position += active
@@ -758,6 +758,13 @@ def _as_wide(
         if name in wanted else e
         for name, e in estimates.items()
     }  # fmt: skip
+
+
+def _blurred(estimate: Estimate, half: float) -> Estimate:
+    """An estimate that is uncertain by so much besides what its interval says."""
+    below, above = estimate.value - estimate.low, estimate.high - estimate.value
+    low, high = estimate.value - math.hypot(below, half), estimate.value + math.hypot(above, half)
+    return dataclasses.replace(estimate, low=low, high=high)
 
 
 def _doubted_by_scale(named: Sequence[NamedTerm]) -> tuple[NamedTerm, ...]:

@@ -28,6 +28,7 @@ from pcw_description.effects.kinds import (
     JointTorqueEffect,
     TransmissionEffect,
 )
+from pcw_description.effects.low_friction_patch import EDGE
 from pcw_description.effects.registry import all_effects
 from pcw_description.robot_description import AXIS_NAMES, RobotDescription
 
@@ -317,7 +318,7 @@ class _TermMaker:
             is_exact=not isinstance(effect, ClockEffect) or self.exact_clocks,
             is_curved=not (isinstance(effect, ClockEffect) and self.exact_clocks),
             resolution=chosen.resolution,
-            blur=self._blur_of_times() if look == "windows" else {},
+            blur=self._blur_of_times() if look == "windows" else _blur_of_borders() if look == "patches" else {},
             unsure={"play": OF_A_PLAY[axis or effect.axis]} if "play" in names else {},
             settled=_heights(effect) if {"x", "y"} == set(chosen.resolution) else {},
             grid_size=chosen.among,
@@ -484,6 +485,17 @@ def _look_of(effect: Effect) -> str:
         if shaping <= names:
             return look
     return "patches" if isinstance(effect, ContactEffect) and {"x", "y", "length", "width"} <= names else ""
+
+
+def _blur_of_borders() -> dict[str, float]:
+    """Standard deviations [m] of where a patch is and how far it reaches, of which no wheel touches a point.
+
+    A border is felt anywhere within the length over which a tyre stands on it: many crossings tell where far more closely than
+    it is known what they tell of. That is the same for all of them, and of the two borders of a side it is not the same.
+    """
+    border = EDGE / math.sqrt(12.0)
+    middle, side = border / math.sqrt(2.0), border * math.sqrt(2.0)
+    return {"x": middle, "y": middle, "length": side, "width": side}
 
 
 def _heights(effect: Effect) -> dict[str, tuple[float, float, float]]:
