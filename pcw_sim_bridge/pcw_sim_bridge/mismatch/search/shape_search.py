@@ -24,6 +24,8 @@ DROP = 1.92
 # Widest interval of a parameter on a logarithmic scale, as a ratio to either side.
 WIDEST_RATIO = 30.0
 UNSEEN_STEPS = 200.0  # to either side of what happens once, on a linear scale
+# What moves the other way by as much, so that what began earlier ends when it did: each end of it is seen by itself.
+OPPOSITE = {"start": "duration", "duration": "start"}
 COARSE = 7  # points between the neighbours on the grid
 SWEEPS = 3  # over all parameters, as long as one gains
 WORTH = 0.1  # nats; a further point that promises less is not asked for
@@ -61,15 +63,18 @@ def shape_interval(
     kind, spacing = regression.problem.terms[instance.term].resolution.get(name, ("", 0.0))
     if not kind or (kind == "log" and centre <= 0.0):
         return centre, centre
-    place = _Place(ShapeTrials(regression, others, instance), instance, name, kind)
+    trials = ShapeTrials(regression, others, instance)
+    ways = [_Place(trials, instance, name, kind)]
+    if OPPOSITE.get(name) in dict(instance.shape):
+        ways.append(_Place(trials, instance, name, kind, against=OPPOSITE[name]))
     # What happened once may have ended, or its patch, anywhere in a time or on a floor from which nothing can be judged: just
     # beyond what can be judged the filter still sees it, and further away all is possible again.
     once = regression.problem.terms[instance.term].once
     steps = UNSEEN_STEPS if once else 2.0
     widest = math.log(WIDEST_RATIO) if kind == "log" else steps * spacing
-    best, drop = place.evidence(0.0), DROP * widening
 
-    def end(direction: float) -> float:
+    def end(place: _Place, direction: float) -> float:
+        best, drop = place.evidence(0.0), DROP * widening
         inner, outer = 0.0, 1e-4 * (1.0 if kind == "log" else spacing)
         further = outer
         while further < widest and (once or further == outer):
@@ -84,15 +89,22 @@ def shape_interval(
                 outer = middle
         return place.value(direction * min(outer, widest))
 
-    return end(-1.0), end(1.0)
+    return min(end(place, -1.0) for place in ways), max(end(place, 1.0) for place in ways)
 
 
 class _Place:
-    """One shaping parameter of an instance, on the scale that it is searched on; steps count from where it is."""
+    """One shaping parameter of an instance, on the scale that it is searched on; steps count from where it is.
 
-    def __init__(self, trials: ShapeTrials, instance: Instance, name: str, kind: str, bounded: bool = False) -> None:
+    Args:
+        bounded: where sizes are that can be, if they can be anywhere.
+        against: the name of another one, which goes the other way by as much.
+    """
+
+    def __init__(
+        self, trials: ShapeTrials, instance: Instance, name: str, kind: str, bounded: bool = False, against: str = ""
+    ) -> None:
         self._trials, self._instance = trials, instance
-        self._name, self._kind = name, kind
+        self._name, self._kind, self._against = name, kind, against
         self._known: dict[float, float] = {}
         self.whole = trials.whole
         self._least = trials.regression.problem.terms[instance.term].least.get(name, -math.inf)
@@ -112,7 +124,10 @@ class _Place:
         """The instance at a step."""
         if step == 0.0:
             return self._instance
-        return self._trials.regression.with_shape(self._instance, {**dict(self._instance.shape), self._name: self.value(step)})
+        shape = dict(self._instance.shape)
+        if self._against:
+            shape[self._against] -= self.value(step) - shape[self._name]
+        return self._trials.regression.with_shape(self._instance, {**shape, self._name: self.value(step)})
 
     def evidence(self, step: float) -> float:
         """Log evidence there; none where the size would have to be one that cannot be."""
