@@ -146,6 +146,19 @@ def test_the_analysis_does_not_read_the_answers(challenge: Path, tmp_path: Path)
     assert json.dumps(reports[0]) == json.dumps(reports[1])
 
 
+def test_cases_that_are_not_recorded_yet_are_not_left_out_in_silence(tmp_path: Path) -> None:
+    """A folder that was still being made was analysed as if it were whole."""
+    said: list[str] = []
+    case = tmp_path / "case_0001"
+    case.mkdir()
+    (case / "robot.yaml").write_text("format: none\n")
+    run(tmp_path, said.append, workers=1)
+    assert not any("not all cases" in line for line in said)
+    (tmp_path / ".case_0002.part").mkdir()
+    run(tmp_path, said.append, workers=1)
+    assert "not all cases are recorded yet" in said[-2]
+
+
 def test_baselines_without_what_they_need_are_told_before_any_analysis(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

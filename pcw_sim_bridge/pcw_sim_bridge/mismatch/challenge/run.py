@@ -44,6 +44,8 @@ def run(
     if baselines:
         _baseline_function()  # before an analysis of minutes
     cases = case_folders(folder)
+    if any(folder.glob(".case_*.part")):  # as `make` calls those that are not whole
+        progress("not all cases are recorded yet, and the others are left out: `challenge make` is at work, or was ended")
     reports = reports or folder / "reports"
     todo = [case for case in cases if not _is_done(reports / case.name, baselines)]
     if len(todo) < len(cases):
