@@ -377,16 +377,20 @@ def _tolerated(search: EffectSearch, selection: Selection) -> int | None:
 
 
 def explanation_by(explanation: Explanation, instances: Sequence[Instance], known: bool = False) -> Explanation:
-    """Return the explanation by these effects alone: fitted again, and what is left tested again.
+    """Return the explanation by these effects alone: made exact and fitted again, and what is left tested again.
+
+    Where the problem was exact with others at work numbers stand as beside those: what they then leave is no finding.
 
     Args:
         explanation: of the same problem.
         instances: effects.
-        known: whether they are there whatever this problem says, as others know of them.
+        known: whether they are there as they are whatever this problem says, as others know of them.
     """
     search, threshold = explanation.search, explanation.selection.threshold
-    selection = search.conclude(instances, threshold)
-    if not known:
+    if known:
+        selection = search.conclude(instances, threshold)
+    else:
+        selection = search.conclude(search.made_exact(tuple(instances)), threshold)
         selection = search.balanced(search.bounded(search.retuned_away(selection)))
     instances = selection.fit.instances
     result = OpenSetTest(search, selection.fit.instances).run(threshold)
@@ -403,7 +407,7 @@ def explanation_by(explanation: Explanation, instances: Sequence[Instance], know
 def explanation_instead(explanation: Explanation, own: Instance, rival: Instance) -> Explanation:
     """Return the explanation with another effect in one's place, made exact there; what it was is to be come back to."""
     others = tuple(instance for instance in explanation.fit.instances if instance != own)
-    return explanation_by(explanation, explanation.search.made_exact((*others, rival)))
+    return explanation_by(explanation, (*others, rival))
 
 
 def _doubted(entry: NamedTerm, doubts: Mapping[Instance, tuple[float, str]]) -> NamedTerm:

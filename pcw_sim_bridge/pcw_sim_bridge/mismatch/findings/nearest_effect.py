@@ -25,7 +25,7 @@ def with_the_nearest(explanation: Explanation) -> Explanation:
         return explanation
     assert nearest.refused is not None
     here = search.place
-    instead = explanation_by(explanation, search.made_exact((nearest.refused,)))
+    instead = explanation_by(explanation, (nearest.refused,))
     selection = instead.selection
     stands = bool(instead.named) and selection.losses[0] >= selection.threshold and selection.held_out[0] > 0.0
     if not stands or any(entry.ambiguous_with for entry in instead.named):

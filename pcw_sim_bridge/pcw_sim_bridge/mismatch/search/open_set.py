@@ -148,6 +148,8 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
             continue
         before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
         search, selection, final = _adopted(search, selection, law)
+        # Until now numbers are where they were without the law: what that leaves would pass for a name beside it.
+        selection = search.conclude(search.made_exact(selection.fit.instances), selection.threshold)
         selection = _without_mere_relief(search, _with_names_beside(search, selection))
         after = {i.term for i in selection.fit.instances}
         withdrawn += [(search.label(i), " and ".join(final.depends_on)) for i in before if i.term not in after]
