@@ -346,6 +346,7 @@ def test_what_is_a_function_of_a_law_s_own_arguments_is_not_named_beside_it() ->
             problem=problem, grow=lambda regression, instances, least, grown=grown: grown,
             improve=lambda regression, instances: instances, whiten_beside=lambda instances: None,
             prune=lambda regression, instances, threshold: chosen(instances),
+            made_exact=lambda instances: instances, conclude=lambda instances, threshold: chosen(instances),
         )  # fmt: skip
         found = open_set._with_names_beside(search, chosen((name, law)))  # type: ignore[arg-type]
         assert found.fit.instances == wanted

@@ -659,3 +659,37 @@ def test_a_name_that_is_less_sure_for_a_law_that_is_not_told_says_so(monkeypatch
         judged = open_set.judge(search, selection, left)  # type: ignore[arg-type]
         assert judged.beliefs == {0: belief}
         assert judged.doubts == wanted
+
+
+def test_what_a_law_or_a_dropped_effect_leaves_is_asked_where_the_problem_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drag that was told rightly cast shadows: numbers stood as without it, tyres were named, and two more laws without."""
+    here, exact, asked = (Instance(0, (), (0,)),), (Instance(0, (), (1,)),), []
+    nothing = SimpleNamespace(instances=())
+
+    def concluded(instances: tuple[Instance, ...], threshold: float) -> SimpleNamespace:
+        return SimpleNamespace(fit=SimpleNamespace(instances=tuple(instances)), threshold=threshold, regression=nothing)
+
+    def same(selection: SimpleNamespace) -> SimpleNamespace:
+        return selection
+
+    search = SimpleNamespace(
+        problem=SimpleNamespace(terms=[SimpleNamespace(effect=UNKNOWN, arguments=("speed",))]), conclude=concluded,
+        made_exact=lambda instances: exact, retuned_away=same, bounded=same, balanced=same,
+        improve=lambda regression, instances: instances, grow=lambda regression, instances, threshold: instances,
+    )  # fmt: skip
+    beside = open_set._with_names_beside(search, concluded(here, 3.0))  # type: ignore[arg-type]
+    assert beside.fit.instances == exact
+
+    def tested(search: object, instances: tuple[Instance, ...]) -> SimpleNamespace:
+        asked.append(instances)
+        return SimpleNamespace(run=lambda threshold: open_set.OpenSetResult((), (), np.zeros(1)))
+
+    monkeypatch.setattr(explanation, "OpenSetTest", tested)
+    monkeypatch.setattr(explanation, "named_terms", lambda search, selection: ())
+    monkeypatch.setattr(explanation, "_p_values", lambda search, selection, result: ())
+    before = explanation.Explanation(
+        search, concluded(here, 3.0), (), (), (), None, (), np.zeros(1), np.zeros(1)  # type: ignore[arg-type]
+    )
+    for known in (False, True):
+        explanation.explanation_by(before, here, known)
+    assert asked == [exact, here]

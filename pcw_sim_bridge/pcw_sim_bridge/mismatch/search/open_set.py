@@ -148,8 +148,6 @@ def judge(search: EffectSearch, selection: Selection, left: OpenSetResult) -> Ju
             continue
         before = [i for i in selection.fit.instances if not is_unknown(search.problem, i)]
         search, selection, final = _adopted(search, selection, law)
-        # Until now numbers are where they were without the law: what that leaves would pass for a name beside it.
-        selection = search.conclude(search.made_exact(selection.fit.instances), selection.threshold)
         selection = _without_mere_relief(search, _with_names_beside(search, selection))
         after = {i.term for i in selection.fit.instances}
         withdrawn += [(search.label(i), " and ".join(final.depends_on)) for i in before if i.term not in after]
@@ -321,6 +319,8 @@ def _with_names_beside(search: EffectSearch, selection: Selection) -> Selection:
 
     Before, all that the law explains was noise to them: one that does a little of its work was named, and none of the others.
     """
+    # Until now numbers are where they were without the law: what that leaves would pass for such an effect.
+    selection = search.conclude(search.made_exact(selection.fit.instances), selection.threshold)
     instances = selection.fit.instances
     laws = {i for i in instances if is_unknown(search.problem, i)}
     grown = search.grow(selection.regression, search.improve(selection.regression, instances), selection.threshold)
