@@ -31,6 +31,9 @@ INERTIAS = ("module.", "wheel.inertia", "rotors.")  # of numbers in whose place 
 FLOOR = ("ground.slope.x", "ground.slope.y")
 # [rad/s]; of the velocity loops of drives, and the largest part of their torque that their reports may lack.
 LOOP_BANDWIDTH, LARGEST_UNREPORTED = 50.0, 0.3
+# [1/s]; of what wheels bear more or less than at rest, so much may come and go within the cycles of drives that hold speeds:
+# a fortieth of it every 5 ms.
+LOAD_UNREST = 5.0
 # Numbers of tyres, and how late a wheel follows its heading, which is the later the more its contact yields: most of all in
 # other simulations, by soft constraints.
 LOOSE = ("contact.", "heading_lead")
@@ -112,6 +115,10 @@ def varied_numbers(robot: RobotDescription, differences: ChannelDifferences) -> 
         # Nor does anybody know how much rubber damps: by that a soft tyre would be found too short or too long.
         found.append(VariedNumber("contact.damping_time", "s", DAMPING_TIME, 0.5 * DAMPING_TIME, _entry("damping_time")))
         found += _unreported(differences)
+        if any(np.any(motion.loops) for motion in differences.motions):
+            # Torques that leap once a cycle make loads come and go, and what comes takes up slip each time: next to nothing
+            # at speed, and most of it where a robot stops hard, as if there were less friction.
+            found.append(VariedNumber("contact.load_unrest", "1/s", 0.0, LOAD_UNREST, _entry("load_unrest")))
         found += _crosstalk(robot)
     if layout.imu:
         found += _within_cycle(differences)

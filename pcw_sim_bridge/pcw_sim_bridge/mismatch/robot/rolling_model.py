@@ -15,10 +15,11 @@ A chassis that leans on its springs, or stands on uneven ground or on a wheel th
 the vertical in its horizontal axes, the contact is where the wheel is lowest, b_x = b_x0 - r t_x in the wheel's frame, and
 weights turn the steering.
 
-and the tyre under that force slips: eps = |V_w| lambda(F) + L (d lambda / dt + lambda max(dN/dt, 0) / N), the relaxed slip
-solved for eps. The robot's twist is the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a
-missing force of a tenth of the whole, growing with frequency; the channels end well below the resonance of the robot on its
-tyres. Where no torques were recorded, the forces are those that the motion asks of the wheels, shared as evenly as can be.
+and the tyre under that force slips: eps = V lambda(F) + L (d lambda / dt + lambda max(dN/dt, 0) / N), the relaxed slip solved
+for eps, with the faster of tread and wheel, V = max(|r rho_dot|, |V_w|), V_w = (r rho_dot, 0) - eps. The robot's twist is
+the wheels' without it, V = A^+ (B q_dot - eps). Left out, this slip would pass for a missing force of a tenth of the whole,
+growing with frequency; the channels end well below the resonance of the robot on its tyres. Where no torques were recorded,
+the forces are those that the motion asks of the wheels, shared as evenly as can be.
 
 Every number of the description that a healthy robot may differ in is a nuisance column, by differences of the whole
 model; so is every effect. Robots whose wheels have no offset along their heading (b_x = 0), or that have a fixed axle,
@@ -30,6 +31,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -59,8 +61,9 @@ from .robot_motion import RobotMotion, tracked_place
 
 # Of the numbers of the model those that say nothing of how wheels move, but what is felt, sensed and slips.
 OF_NO_MOTION = frozenset((
-    "gain", "crosstalk", "coupling", "torque_lag", "unreported", "tyres", "damping_time", "softness", "imu_position",
-    "imu_height", "gyro_bias", "gyro_scale", "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock", "tracked",
+    "gain", "crosstalk", "coupling", "torque_lag", "unreported", "tyres", "damping_time", "load_unrest", "softness",
+    "imu_position", "imu_height", "gyro_bias", "gyro_scale", "accelerometer_bias", "accelerometer_scale", "imu_lean", "clock",
+    "tracked",
 ))  # fmt: skip
 FORCE_STEP = 1e-3  # of the load on a wheel, by which the slopes of its tyre's curves are taken
 WRENCH = ("chassis_force/x", "chassis_force/y", "chassis_torque/z")
@@ -237,6 +240,8 @@ class ModelNumbers:
         tracked: where what is tracked stands: x, y [m], yaw [rad] in base_link.
         tyres: numbers of the tyres (n + k, TYRE_SIZE); softness: slip at the contact per slip of these (n + k, 2).
         damping_time: of their rubber [s]: a tyre's force is ahead of its relaxed slip by this.
+        load_unrest: rate [1/s] at which loads grow while they come and go faster than a recording shows, as a part of what
+            they are more or less than at rest: torques that leap make them leap, the more the more they accelerate.
         torque_lag: how long before its stamp a reported torque acted, relative to the position beside it [s].
         unreported: how much of each kind of `loops` the joints were given more than drives that hold speeds report
             (n, 2, 2) [1], [1/s].
@@ -271,6 +276,7 @@ class ModelNumbers:
     tracked: FloatArray
     tyres: FloatArray
     damping_time: float
+    load_unrest: float
     softness: FloatArray
     torque_lag: float
     unreported: FloatArray
@@ -342,6 +348,7 @@ class ModelNumbers:
             tracked=tracked_place(robot),
             tyres=np.array([tyre_parameters(tyre) for tyre in (*robot.tyres, *(robot.contact for _ in robot.fixed_axle))]),
             damping_time=DAMPING_TIME,
+            load_unrest=0.0,
             softness=np.ones((robot.n + len(robot.fixed_axle), 2)),
             torque_lag=0.0,
             unreported=np.zeros((robot.n, 2, 2)),
@@ -648,11 +655,22 @@ def slips(
 
 
 def slips_of_ratios(numbers: ModelNumbers, rate: float, wheels: WheelMotion, ratio: FloatArray) -> FloatArray:
-    """Slip velocities (T, n, 2) [m/s] of rolling tyres whose forces ask for slip ratios (T, n, 2) where nothing changes."""
+    """Slip velocities (T, n, 2) [m/s] of rolling tyres whose forces ask for slip ratios (T, n, 2) where nothing changes.
+
+    Ratios are of the faster of tread and wheel. A wheel that brakes is faster than its tread, by the slip itself: taken for
+    as fast its slip would be too small by that part of it, as if it bent more with the force on a floor of less friction.
+    """
     ratio = numbers.softness * ratio
     ratio -= numbers.damping_time * derivative(ratio, rate)
-    result: FloatArray = wheels.speed[:, :, None] * ratio
-    result += numbers.tyres[:, LENGTH, None] * (derivative(ratio, rate) + loading(wheels.normal, rate)[:, :, None] * ratio)
+    growth = loading(wheels.normal, rate)
+    if numbers.load_unrest:
+        at_rest = normal_forces(numbers, wheels.direction, np.zeros((len(ratio), 2)), wheels.height)
+        growth = growth + numbers.load_unrest * np.abs(wheels.normal - at_rest) / np.maximum(wheels.normal, 1.0)
+    lag = numbers.tyres[:, LENGTH, None] * (derivative(ratio, rate) + growth[:, :, None] * ratio)
+    slip = wheels.speed[:, :, None] * ratio + lag
+    # Two rounds of it would differ by the square of a ratio.
+    speed = np.maximum(wheels.speed, np.hypot(wheels.tread - slip[:, :, 0], slip[:, :, 1]))
+    result: FloatArray = speed[:, :, None] * ratio + lag
     return result
 
 
@@ -665,13 +683,13 @@ def loading(normal: FloatArray, rate: float) -> FloatArray:
     return growth
 
 
-def _axle_speeds(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
-    """Rolling speeds (T, k) of fixed axles in a motion (T, 3)."""
+def _axle_velocities(numbers: ModelNumbers, twist: FloatArray) -> FloatArray:
+    """Velocities (T, k) of fixed axles along their headings in a motion (T, 3)."""
     x, y, heading = numbers.axle.T
     along = twist[:, :1] - twist[:, 2:] * y
     across = twist[:, 1:2] + twist[:, 2:] * x
-    speeds: FloatArray = np.abs(np.cos(heading) * along + np.sin(heading) * across)
-    return speeds
+    velocities: FloatArray = np.cos(heading) * along + np.sin(heading) * across
+    return velocities
 
 
 def wrench_of(numbers: ModelNumbers, state: RollingState) -> FloatArray:
@@ -756,7 +774,7 @@ class WheelMotion:
         twist, twist_dot: that all wheels have together (T, 3); contradiction: what contradicts it (T, n, 2).
         felt: the latter of a robot on level ground under the same forces (T, 3); tilt: of its chassis (T, 2), standing: the
             part of it by the heights under its wheels.
-        normal, speed: loads [N] and rolling speeds [m/s] (T, n + k), fixed axles last.
+        normal, tread: loads [N], and velocities of the treads along the headings [m/s] (T, n + k), fixed axles last.
     """
 
     motion: RobotMotion
@@ -776,7 +794,12 @@ class WheelMotion:
     tilt: FloatArray
     standing: FloatArray
     normal: FloatArray
-    speed: FloatArray
+    tread: FloatArray
+
+    @functools.cached_property
+    def speed(self) -> FloatArray:
+        """Rolling speeds (T, n + k) [m/s]."""
+        return np.abs(self.tread)
 
     def holds_for(self, motion: RobotMotion, numbers: ModelNumbers, around: Surroundings) -> bool:
         """Whether it is that of this very motion and of these surroundings, and of such numbers."""
@@ -836,10 +859,10 @@ def wheel_motion(motion: RobotMotion, numbers: ModelNumbers, around: Surrounding
         twist_dot = derivative(twist, motion.rate)
     felt = _without(twist_dot, pull)
     normal = normal_forces(numbers, direction, acceleration_of(twist, felt), around.height)
-    speed = np.concatenate([np.abs(velocity[:, :, DRIVE] * numbers.radius), _axle_speeds(numbers, twist)], axis=1)
+    tread = np.concatenate([velocity[:, :, DRIVE] * numbers.radius, _axle_velocities(numbers, twist)], axis=1)
     return WheelMotion(
         motion, numbers, around.radius, around.pull, around.height,
-        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, felt, tilt, standing, normal, speed,
+        steer_angle, direction, radius, offset, velocity, twist, twist_dot, contradiction, felt, tilt, standing, normal, tread,
     )  # fmt: skip
 
 
