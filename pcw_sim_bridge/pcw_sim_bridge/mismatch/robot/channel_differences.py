@@ -9,7 +9,7 @@ import numpy as np
 
 from pcw_description.effect_instance import EffectInstance
 
-from ..regression.regression_problem import FloatArray
+from ..regression.regression_problem import BoolArray, FloatArray
 from ..regression.signal_filter import SignalFilter
 from .joint_balance import JointResponse
 from .robot_effects import ChannelModel
@@ -85,6 +85,11 @@ class ChannelDifferences:
     def filtered(self, pieces: Sequence[FloatArray]) -> FloatArray:
         """Filter one array (T, ...) per motion and put them on end."""
         return np.concatenate([f.apply(piece) for f, piece in zip(self.filters, pieces, strict=True)])
+
+    def left_by(self, samples: Sequence[BoolArray]) -> FloatArray:
+        """What some samples (T,) of each motion leave in the residual (T, C), as far as the filter reaches."""
+        pairs = zip(self._sides, samples, strict=True)
+        return self.filtered([np.where(own[:, None], np.nan_to_num(m - p), 0.0) for (m, p), own in pairs])
 
     def of_numbers(self, vary: Callable[[ModelNumbers, float], None], step: float) -> FloatArray:
         """Column (T, C): what the residual holds per unit by which a number of the model is off."""

@@ -25,6 +25,7 @@ from ..all_cores import on_all_cores
 from ..errors import MismatchError
 from ..found_effect import effect_instance
 from ..readings.unresolved_motion import unresolved_rate
+from ..regression.noise_model import channel_deviations
 from ..regression.regression_problem import (
     BoolArray,
     Channel,
@@ -457,17 +458,22 @@ class RobotProblemBuilder:
                 for motion, known in zip(self.motions, differences.known, strict=True)
             ]
             return differences.filtered(stands) < 0.1
-        pieces, seeming = [], self._seeming_numbers(differences)
+        pieces, slides, seeming = [], [], self._seeming_numbers(differences)
         for motion, known, state in zip(self.motions, differences.known, differences.on_ground, strict=True):
             bad = slipping(seeming, motion, self.layout)
             if self.layout.balanced and not at_peak:
                 bad |= used_friction(self.numbers, state) > USED_PART
+            slides.append(bad)
             bad = disturbed(bad, max(round(RINGING * motion.rate / self.cutoff), 1))
             if self.layout.balanced:
                 bad |= np.all(np.abs(motion.velocity[:, :, DRIVE]) < STILL_SPEED, axis=1)
                 bad |= self._stuck(motion) & ~self._holding.any()
             pieces.append((bad[:, None] | ~known).astype(float))
-        return (differences.filtered(pieces) < 0.1) & ~self._silent(differences)
+        valid = (differences.filtered(pieces) < 0.1) & ~self._silent(differences)
+        # A slip that is hundreds of times larger than all others is felt farther, and says that tyres slip otherwise.
+        usual = channel_deviations(differences.residual, valid)
+        reached = np.any(valid & (np.abs(differences.left_by(slides)) > usual), axis=1)
+        return valid & ~reached[:, None]
 
     def _stuck(self, motion: RobotMotion) -> BoolArray:
         """Samples (T,) in which a steering that sticks stands, or turns so slowly that a smoothed friction is not whole."""
