@@ -128,8 +128,8 @@ import gc, pickle, sys
 from numba.core.dispatcher import Dispatcher
 from pcw_description import load_robot
 from pcw_description.recording_files import RawMessage
-from pcw_sim_bridge.mismatch.live_channels import LiveChannels, LiveParameters
-from pcw_sim_bridge.mismatch.live_trials import judgements
+from pcw_sim_bridge.mismatch.live.live_channels import LiveChannels, LiveParameters
+from pcw_sim_bridge.mismatch.live.live_trials import judgements
 
 def kernels():
     found = [kernel for kernel in gc.get_objects() if isinstance(kernel, Dispatcher)]
