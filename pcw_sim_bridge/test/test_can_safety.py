@@ -78,6 +78,8 @@ def test_a_command_that_answers_an_old_reading_is_as_good_as_none():
     for _ in range(20):
         driven.can.cycle(lambda _: driven.can.command(ONES, first.time))
     assert names(driven) == ["command_timeout"] and torques(driven) == 0.0
+    # "none for 44 ms" sent people to look for a controller that was silent, and theirs was not.
+    assert "came, but by their stamps too old, and none of use for" in driven.can.faults[0].detail
     assert 8 <= driven.can.counters.stale_commands <= 11  # those in the first 40 ms are not old yet
 
 
@@ -186,6 +188,29 @@ def test_a_message_that_no_longer_comes_is_missed_though_positions_come(protocol
     assert torques(driven) == 0.0
 
 
+@pytest.mark.parametrize("answers", [False, True])
+def test_drives_that_cannot_be_set_up_again_leave_a_fault(answers):
+    """None was left: the driver looked healthy, and `activate` asked for a configure that an inactive node does not have."""
+    driven = rig()
+    lost = driven.emulated._by_name["front_left_drive"]
+    if answers:  # as beside another computer that sets up the same drives
+        receive = driven.transport.receive
+        driven.transport.receive = lambda timeout: [one for one in receive(timeout) if one.frame.id != 0x181]
+    else:
+        lost.dead = True
+    with pytest.raises(CanError, match="front_left_drive: "):
+        driven.can.clear_faults()
+    driven.can.cycle(None)
+    assert driven.can.state == "fault" and names(driven) == ["not_set_up"]
+    assert "front_left_drive" in driven.can.faults[0].detail and "\n" not in str(driven.can.faults[0])
+    with pytest.raises(CanError, match="allowed: clear_faults first"):
+        driven.can.enable()
+    if not answers:
+        lost.dead = False
+        driven.can.clear_faults()
+        driven.can.enable()
+
+
 def test_a_bus_that_fails_while_faults_are_cleared_is_not_forgotten():
     driven = rig()
     handle = driven.can._cycle_once
@@ -197,7 +222,7 @@ def test_a_bus_that_fails_while_faults_are_cleared_is_not_forgotten():
     driven.can._cycle_once = failing
     with pytest.raises(CanError, match="bus_off at can0"):
         driven.can.clear_faults()
-    with pytest.raises(CanError, match="allowed: configure first"):
+    with pytest.raises(CanError, match="bus_off at can0.*allowed: clear_faults first"):
         driven.can.enable()
 
 

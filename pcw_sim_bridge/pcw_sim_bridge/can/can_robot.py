@@ -139,6 +139,7 @@ class CanRobot:
         self.homing_results: dict[str, str] = {}
         self._command: JointCommand | None = None
         self._command_time: float | None = None
+        self._stale_in_row = 0  # since the newest command that was of use
         self._sent_in_cycle = self._waiting = False  # a command has gone out in this period; a newer one waits for the next
         self._next_tick: float | None = None
         self._next_heartbeat = -np.inf
@@ -187,9 +188,13 @@ class CanRobot:
         """Set every drive up anew and forget the faults; gives no torque.
 
         Raises:
-            CanError: a fault that stays.
+            CanError: a fault that stays; of drives that cannot be set up one is left, which the next `clear_faults` may clear.
         """
-        self.configure()
+        try:
+            self.configure()
+        except CanError as error:
+            self.faults = self.faults or [Fault("not_set_up", "the drives", "; ".join(str(error).splitlines()))]
+            raise
 
     def _run(self, procedures: Sequence[tuple[Drive, Procedure]]) -> None:
         """Run procedures of several drives at once; each asks one question at a time.
@@ -247,15 +252,15 @@ class CanRobot:
             CanError: not configured, a fault that has not been cleared, or homing under way.
         """
         with self._lock:
-            if not self.configured:
-                raise CanError("torque is not allowed before the drives are configured; allowed: configure first")
             if self.faults:
                 raise CanError(f"torque is not allowed after {'; '.join(map(str, self.faults))}; allowed: clear_faults first")
+            if not self.configured:
+                raise CanError("torque is not allowed before the drives are configured; allowed: configure first")
             if self._homing:
                 raise CanError(
                     f"torque is not allowed while {', '.join(self._homing)} look for their marks; allowed: afterwards"
                 )
-            self._command, self._command_time, self._sent_in_cycle = None, None, False
+            self._command, self._command_time, self._stale_in_row, self._sent_in_cycle = None, None, 0, False
             for drive in self.drives:
                 if drive.feedback.state is DriveState.ENABLED:
                     drive.feedback.state = DriveState.DISABLED  # said before it was told to be; it has to say so anew
@@ -352,12 +357,13 @@ class CanRobot:
                 return
             if answers is not None and now - answers > self.file.timeouts.command:
                 self.counters.stale_commands += 1
+                self._stale_in_row += 1
                 return
             if command is None:
                 self.counters.refused_commands += 1
             if self._waiting:
                 self.counters.held_back += 1
-            self._command, self._command_time = command, now
+            self._command, self._command_time, self._stale_in_row = command, now, 0
             self._waiting = self._sent_in_cycle
             if not self._sent_in_cycle:
                 self._send_outputs(now)
@@ -545,7 +551,10 @@ class CanRobot:
             found += watch.look(now, self.armed, torque, watch_encoder=not looking)
         if self.armed and self._command_time is not None and now - self._command_time > self.file.timeouts.command:
             age, allowed = (now - self._command_time) * 1000, self.file.timeouts.command * 1000
-            found.append(Fault("command_timeout", "joint_commands", f"none for {age:.0f} ms, allowed {allowed:.0f} ms"))
+            said = "none"
+            if self._stale_in_row:  # they come: nobody shall look for a controller that is silent
+                said = f"{self._stale_in_row} came, but by their stamps too old, and none of use"
+            found.append(Fault("command_timeout", "joint_commands", f"{said} for {age:.0f} ms, allowed {allowed:.0f} ms"))
         found += self._standing
         self._standing = []
         if found:
