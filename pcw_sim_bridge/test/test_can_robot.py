@@ -1,7 +1,9 @@
 """The robot behind its drives, in simulated time: torque on and off, faults, homing, calibration, logs, the doctor."""
 
 import math
+import queue
 import shutil
+import threading
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from pcw_description.recording import Recording
 from pcw_sim_bridge.can.can_file import can_file_from, find_can_file, joint_place, read_can_file
 from pcw_sim_bridge.can.can_steer_zero import run as steer_zero
 from pcw_sim_bridge.can.doctor import examine
-from pcw_sim_bridge.can.drive_emulator import read_faults
+from pcw_sim_bridge.can.drive_emulator import read_faults, serve
 from pcw_sim_bridge.can.emulated_robot import EmulatedRobot, EmulatedTransport
 from pcw_sim_bridge.can.errors import CanError
 from pcw_sim_bridge.can.frame import ERROR_BUS_OFF, Arrived, Frame
@@ -469,6 +471,41 @@ def test_the_doctor_says_what_is_wrong():
 
     found = [str(f) for f in findings(change=counts) if not f.good]
     assert len(found) == 1 and "rear_right_drive" in found[0] and "gear, counts or torque constant are wrong" in found[0]
+
+
+class Late:
+    """A bus on which frames wait while the emulator is kept from running, and its end."""
+
+    def __init__(self, begin, late, frames, stopped):
+        self.time, self._late, self._frames, self._stopped, self.sent = begin, late, frames, stopped, []
+
+    def now(self):
+        return self.time
+
+    def send(self, bus, frame):
+        self.sent.append(frame)
+
+    def receive(self, timeout):
+        self._stopped.set()
+        self.time, self._late = self.time + self._late, 0.0
+        taken, self._frames = self._frames[:64], self._frames[64:]
+        return [Arrived("can0", frame, self.time) for frame in taken]
+
+
+def test_an_emulator_that_was_kept_waiting_answers_as_drives_in_hardware_would_have():
+    """On a busy laptop drives tripped their watchdogs, and said one count to many SYNCs, as a dead encoder does."""
+    driven = rig()
+    driven.torque[:, 0] = 2.0
+    driven.can.enable()
+    driven.cycles(50)
+    driven.transport.sent = []
+    driven.cycles(20)
+    frames, stopped = [frame for _, frame in driven.transport.sent], threading.Event()
+    bus = Late(driven.emulated.time, 20 * driven.can.period, frames, stopped)
+    serve(driven.emulated, bus, driven.timer, [], queue.Queue(), None, stopped)
+    assert not any(drive.failure for drive in driven.emulated.drives)
+    counts = [frame.data[2:6] for frame in bus.sent if frame.id == 0x181]
+    assert len(counts) == 20 and len(set(counts)) == 20
 
 
 def test_faults_of_the_emulator_are_read_and_refused():

@@ -35,6 +35,7 @@ from .errors import CanError
 from .transport import BusOff, TransmitBufferFull, Transport
 
 ZERO_TORQUE = 1e-9  # [N m]
+MOST_WAITING = 1024  # frames that are taken before the drives answer; a flood must not keep them silent
 
 
 def parser() -> argparse.ArgumentParser:
@@ -191,11 +192,19 @@ def serve(
     dt = emulated.plant.dt
     planned = list(planned)
     while not stopped.is_set():
-        arrived = transport.receive(max(emulated.time + dt - transport.now(), 0.0))
-        emulated.advance(transport.now(), timer.on_step)
-        for one in arrived:
+        arrived = list(transport.receive(max(emulated.time + dt - transport.now(), 0.0)))
+        while 0 < len(arrived) < MOST_WAITING and (waited := transport.receive(0.0)):
+            arrived += waited
+        now = transport.now()
+        emulated.let_go(now)
+        begun = emulated.time
+        # Where this process had to wait, frames have waited too. Drives in hardware would have taken each as it came. If all
+        # come at the end, drives are without a computer for so long, and say one position to several SYNCs.
+        for place, one in enumerate(arrived, start=1):
+            emulated.advance(begun + (now - begun) * place / len(arrived), timer.on_step)
             if not one.frame.error:
                 emulated.receive(one.bus, one.frame)
+        emulated.advance(now, timer.on_step)
         for out in emulated.take():
             try:
                 transport.send(out.bus, out.frame)

@@ -148,10 +148,15 @@ class EmulatedRobot:
 
     # --- Time --------------------------------------------------------------------------------------------
 
-    def advance(self, time: float, on_step: OnStep | None = None) -> None:
-        """Advance plant and drives to a time [s]; what is left of a step waits for the next call."""
+    def let_go(self, time: float) -> None:
+        """Leave out what is too long ago to be made up for at a time [s]."""
         if time - self.time > MOST_BEHIND:
             self.start += time - self.time - MOST_BEHIND
+            self.time = self.start + self._steps * self.plant.dt
+
+    def advance(self, time: float, on_step: OnStep | None = None) -> None:
+        """Advance plant and drives to a time [s]; what is left of a step waits for the next call."""
+        self.let_go(time)
         target = int(math.floor((time - self.start) / self.plant.dt + 1e-6))
         while self._steps < target:
             self.plant.step(self._joint_torque())
