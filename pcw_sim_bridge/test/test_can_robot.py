@@ -20,7 +20,7 @@ from pcw_sim_bridge.can.frame import ERROR_BUS_OFF, Arrived, Frame
 from pcw_sim_bridge.can.simulated_can_run import record_run_over_can
 from pcw_sim_bridge.can.starting_file import starting_content, with_joints
 from pcw_sim_bridge.can.steer_zero import estimate_steer_zeros, write_zeros
-from pcw_sim_bridge.can.trial_rig import ALLOWED_MS, Rig
+from pcw_sim_bridge.can.trial_rig import ALLOWED_MS, ClosableTransport, Rig
 from pcw_sim_bridge.can.trials import DETECTED_BY_DRIVE_ALONE, FAULT_TRIALS, fault_trial, fuzz
 from pcw_sim_bridge.can.verdict_trials import run_verdict
 from pcw_sim_bridge.plants.factory import make_plant
@@ -185,6 +185,12 @@ def test_foreign_nodes_are_counted_and_change_nothing():
     driven.transport.others = [Arrived("can0", Frame(0x201, bytes(5)), 0.0)]  # another computer that commands
     driven.cycles(2)
     assert driven.can.armed and driven.can.foreign[("can0", 0x201)] == 1
+    # Of two drivers on a bus it was said that their frames are nobody's; and who had gone was told for good.
+    assert "another computer or program commands these drives: 0x201 on can0" in driven.can.others()
+    assert "frames of nobody in the file: 0x7FE on can0" in driven.can.others()
+    driven.emulated.inject("bus_heal", "can0")
+    driven.cycles(800)
+    assert driven.can.others() == "" and driven.can.foreign[("can0", 0x201)] == 1
 
 
 def test_an_error_frame_that_is_not_bus_off_is_counted():
@@ -424,13 +430,19 @@ def test_the_analyser_gives_the_same_verdicts_over_can(tmp_path):
 # --- The doctor --------------------------------------------------------------------------------------------
 
 
-def findings(robot=THESIS, change=None, lifted=True, protocol="cia402"):
-    """What the doctor says of drives that are as the file says, but for `change(emulated)`."""
+def findings(robot=THESIS, change=None, lifted=True, protocol="cia402", nudge=True, others=()):
+    """What the doctor says of drives that are as the file says, but for `change(emulated)`, with frames of others."""
     file = can_file_from(starting_content(robot, protocol), robot)
     emulated = EmulatedRobot(make_plant("reduced", robot, lifted=lifted), file)
     if change is not None:
         change(emulated)
-    return list(examine(robot, file, EmulatedTransport(emulated), lifted=lifted))
+    found = []
+    transport = ClosableTransport(emulated)
+    for finding in examine(robot, file, transport, nudge, lifted=lifted):
+        if "node 1 on can0" in finding.text:  # the drives are set up, and it will listen
+            transport.others = [Arrived("can0", frame, 0.0) for frame in others]
+        found.append(finding)
+    return found
 
 
 @pytest.mark.parametrize("lifted", [True, pytest.param(False, marks=NIGHTLY)])
@@ -438,6 +450,13 @@ def test_the_doctor_finds_nothing_wrong_with_a_healthy_robot(lifted):
     found = findings(lifted=lifted)
     assert [str(finding) for finding in found if not finding.good] == []
     assert sum("it turned with its torque" in finding.text for finding in found) == 8
+
+
+def test_the_doctor_says_that_another_computer_commands_the_drives():
+    frames = [Frame(0x77F, b"\x05"), Frame(0x7FE, b"\x05")]
+    found = [f.text for f in findings(nudge=False, others=frames) if not f.good]
+    assert len(found) == 2
+    assert "0x77F is what a computer sends to these drives" in found[0] and "0x7FE is of nobody" in found[1]
 
 
 def test_the_doctor_says_what_is_wrong():

@@ -27,7 +27,7 @@ from ..sensors import JointReading
 from ..simulated_robot import JointCommand
 from .bus_load import BusLoad, check_loads
 from .can_file import CanFile, Homing, counts_per_turn, joint_place
-from .cia402 import HEARTBEAT, STATE_OPERATIONAL, SYNC
+from .cia402 import HEARTBEAT, NMT, STATE_OPERATIONAL, SYNC
 from .drive import OFF, Ask, Drive, DriveState, Mode, Procedure, Want, newer_than
 from .drive_set import bus_loads, make_drives, master_heartbeat
 from .encoder_watch import EncoderWatch
@@ -35,6 +35,7 @@ from .errors import CanError, DriveError
 from .frame import ERROR_BUS_OFF, Arrived, Frame
 from .motor_map import MotorMap
 from .output_gate import OutputGate
+from .sdo import REQUEST
 from .supervisor import HEARTBEATS_MISSED, STILL, DriveWatch, Fault
 from .transport import BusOff, TransmitBufferFull, Transport
 
@@ -44,6 +45,7 @@ MIDDLE, FOLLOWED, LARGEST_SHIFT = 0.5, 0.05, 0.02
 # Behind by so many periods the missed ones are given up, not made up for.
 MOST_BEHIND = 3
 MOST_FOREIGN = 100
+FOREIGN_TOLD = 3.0  # so long after its newest frame a foreign identifier is told [s]; heartbeats come about once a second
 # Ages of commands that are kept for their quantiles.
 AGES_KEPT = 8192
 OLD_FRAMES = 0.2  # for so long frames of another time are thrown away, and no longer on a bus that never falls silent [s]
@@ -125,12 +127,19 @@ class CanRobot:
         self._owners = {(drive.joint.bus, i): drive for drive in self.drives for i in drive.identifiers}
         self._command_ids = {(drive.joint.bus, i) for drive in self.drives for i in drive.command_identifiers}
         self._canopen_buses = sorted({drive.joint.bus for drive in self.drives if drive.joint.protocol == "cia402"})
+        # What only a computer sends: where it comes in, another one commands these drives.
+        self._computer_ids = self._command_ids | {
+            (drive.joint.bus, i)
+            for drive in self.drives if drive.joint.protocol == "cia402"
+            for i in (NMT, SYNC, HEARTBEAT + int(file.master_id), REQUEST + drive.node_id)
+        }  # fmt: skip
         self._lock = threading.RLock()
         self._asks: dict[str, tuple[Drive, Ask]] = {}
         self._answers: dict[str, Frame] = {}
         self.counters = Counters()
         self.faults: list[Fault] = []
         self.foreign: dict[tuple[str, int], int] = {}
+        self._foreign_heard: dict[tuple[str, int], float] = {}
         self.command_ages: list[float] = []
         self.armed = self.configured = False
         self._enabling_since: float | None = None
@@ -532,6 +541,7 @@ class CanRobot:
             self.counters.foreign_frames += 1
             if (bus, frame.id) in self.foreign or len(self.foreign) < MOST_FOREIGN:
                 self.foreign[bus, frame.id] = self.foreign.get((bus, frame.id), 0) + 1
+                self._foreign_heard[bus, frame.id] = time
             return None
         before = drive.refused_frames
         drive.receive(frame, time)
@@ -684,6 +694,24 @@ class CanRobot:
         if self.armed:
             return "armed"
         return "enabling" if self._enabling_since is not None else "off" if self.configured else "not configured"
+
+    def others(self) -> str:
+        """Say who else was on the buses of late; "" if nobody. Who has gone is no longer told: `foreign` keeps the numbers."""
+        now = self.transport.now()
+        lately = [key for key, heard in list(self._foreign_heard.items()) if now - heard < FOREIGN_TOLD]
+        found = []
+        for what, keys in (
+            ("another computer or program commands these drives", [key for key in lately if key in self._computer_ids]),
+            ("frames of nobody in the file", [key for key in lately if key not in self._computer_ids]),
+        ):
+            told = ", ".join(f"0x{identifier:03X} on {bus}" for bus, identifier in keys[:8])
+            if keys:
+                found.append(f"{what}: {told}" + (f" and {len(keys) - 8} more" if len(keys) > 8 else ""))
+        return "; ".join(found)
+
+    def commanded_by_another(self, bus: str, identifier: int) -> bool:
+        """Whether a foreign identifier is one that only a computer sends to these drives."""
+        return (bus, identifier) in self._computer_ids
 
     def age_quantiles(self) -> FloatArray:
         """Return the median, p99, p99.9 and largest age of commands when they left, from the reading they answer [s]."""

@@ -93,8 +93,10 @@ def examine(
     for fault in can.faults:
         yield Finding(False, fault.where, f"{fault.name}: {fault.detail}")
     for bus, identifier in can.foreign:
-        count = can.foreign[bus, identifier]
-        yield Finding(False, bus, f"identifier 0x{identifier:X} is of nobody in {file.name}; it came {count} times")
+        count, whose = can.foreign[bus, identifier], f"of nobody in {file.name}"
+        if can.commanded_by_another(bus, identifier):
+            whose = "what a computer sends to these drives: another one, or a driver, is at work"
+        yield Finding(False, bus, f"identifier 0x{identifier:X} is {whose}; it came {count} times")
 
 
 def _listen(can: CanRobot) -> Iterator[Finding]:

@@ -316,9 +316,9 @@ class CanDriverNode(RobustLifecycleNode):
             level, message = WARN, problems
         elif log_problem := getattr(can.transport, "log_problem", ""):
             level, message = WARN, f"{can.state}; {log_problem}"
-        elif can.foreign:
-            nodes = ", ".join(f"0x{i:03X} on {bus}" for bus, i in list(can.foreign)[:8])
-            level, message = WARN, f"{can.state}; frames of nobody in the file: {nodes}"
+        others = can.others()
+        if others:  # with a fault too: it may be why
+            level, message = max(level, WARN), f"{message}; {others}"
         return Status(
             level, message,
             {
