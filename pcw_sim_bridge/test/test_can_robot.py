@@ -457,6 +457,8 @@ def test_the_doctor_says_that_another_computer_commands_the_drives():
     found = [f.text for f in findings(nudge=False, others=frames) if not f.good]
     assert len(found) == 2
     assert "0x77F is what a computer sends to these drives" in found[0] and "0x7FE is of nobody" in found[1]
+    found = [str(f) for f in findings(others=[Frame(0x201, bytes(7))]) if not f.good]
+    assert "nudge: torque is not allowed while another computer or program commands these drives" in "".join(found)
 
 
 def test_the_doctor_says_what_is_wrong():

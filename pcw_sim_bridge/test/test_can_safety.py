@@ -126,6 +126,20 @@ def test_a_speed_of_before_does_not_act_when_speeds_are_held_again(protocol):
     assert {want[0] for want in wants} == {Mode.TORQUE, Mode.VELOCITY} and all(want[1] == 0.0 for want in wants)
 
 
+@pytest.mark.parametrize(("protocol", "identifier"), [("cia402", 0x201), ("odrive", 1 << 5 | 0x0E)])
+def test_there_is_no_torque_beside_another_computer_that_commands_the_drives(protocol, identifier):
+    """Two drivers on a bus: each would have set the torques of the other."""
+    driven = rig(protocol)
+    driven.transport.others = [Arrived("can0", Frame(identifier, bytes(8)), 0.0)]
+    driven.cycles(2, answered=False)
+    with pytest.raises(CanError, match=f"another computer or program commands these drives.*0x{identifier:03X}"):
+        driven.can.enable()
+    driven.cycles(1, answered=False)
+    assert driven.can.state == "off" and not driven.can.faults
+    driven.cycles(800, answered=False)
+    driven.can.enable()
+
+
 # --- Stopping ----------------------------------------------------------------------------------------------
 
 

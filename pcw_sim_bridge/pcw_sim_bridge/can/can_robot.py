@@ -167,6 +167,7 @@ class CanRobot:
         """
         self.armed, self.configured, self._enabling_since = False, False, None
         self._command, self._homing, self._next_tick = None, {}, None
+        self._foreign_heard = {}
         end = self.transport.now() + OLD_FRAMES
         while self.transport.receive(0.0) and self.transport.now() < end:
             pass  # what came before is of another time
@@ -258,7 +259,7 @@ class CanRobot:
         """Begin to give the drives torque, at first zero; `armed` once all have it.
 
         Raises:
-            CanError: not configured, a fault that has not been cleared, or homing under way.
+            CanError: not configured, a fault that has not been cleared, homing under way, or another computer that commands.
         """
         with self._lock:
             if self.faults:
@@ -268,6 +269,11 @@ class CanRobot:
             if self._homing:
                 raise CanError(
                     f"torque is not allowed while {', '.join(self._homing)} look for their marks; allowed: afterwards"
+                )
+            if others := [f"0x{i:03X} on {bus}" for bus, i in self._heard_lately() if (bus, i) in self._command_ids]:
+                raise CanError(  # the drives would do what either says, by turns
+                    f"torque is not allowed while another computer or program commands these drives ({', '.join(others)}); "
+                    f"allowed: {FOREIGN_TOLD:g} s after it has ended"
                 )
             self._command, self._command_time, self._stale_in_row, self._sent_in_cycle = None, None, 0, False
             for drive in self.drives:
@@ -697,8 +703,7 @@ class CanRobot:
 
     def others(self) -> str:
         """Say who else was on the buses of late; "" if nobody. Who has gone is no longer told: `foreign` keeps the numbers."""
-        now = self.transport.now()
-        lately = [key for key, heard in list(self._foreign_heard.items()) if now - heard < FOREIGN_TOLD]
+        lately = self._heard_lately()
         found = []
         for what, keys in (
             ("another computer or program commands these drives", [key for key in lately if key in self._computer_ids]),
@@ -708,6 +713,10 @@ class CanRobot:
             if keys:
                 found.append(f"{what}: {told}" + (f" and {len(keys) - 8} more" if len(keys) > 8 else ""))
         return "; ".join(found)
+
+    def _heard_lately(self) -> list[tuple[str, int]]:
+        now = self.transport.now()
+        return [key for key, heard in list(self._foreign_heard.items()) if now - heard < FOREIGN_TOLD]
 
     def commanded_by_another(self, bus: str, identifier: int) -> bool:
         """Whether a foreign identifier is one that only a computer sends to these drives."""

@@ -88,6 +88,8 @@ def examine(
                 yield from _nudge(can, name, share, lifted)
                 if can.faults:
                     break
+        except CanError as error:
+            yield Finding(False, "nudge", str(error))
         finally:
             can.request_disable()
     for fault in can.faults:
