@@ -108,7 +108,8 @@ def test_an_interface_that_is_not_there_is_named(tmp_path, capsys):
     content["buses"][0]["interface"] = "socketcn"
     path = tmp_path / "drives.yaml"
     path.write_text(yaml.safe_dump(content))
-    assert "socketcn" in refused(capsys, "can_log", "record", tmp_path / "x.log", "--can-file", path)
+    said = refused(capsys, "can_log", "record", tmp_path / "x.log", "--can-file", path)
+    assert "interface 'socketcn' of bus can0 is not allowed" in said and "socketcan," in said
     assert not (tmp_path / "x.log").exists()
 
 

@@ -220,6 +220,7 @@ def test_autostart_waits_for_drives_that_are_switched_on_later(ros, tmp_path):
     stack = Stack(ros, tmp_path, "cia402", start=False)
     stack.start_driver("-p", "autostart:=true")
     ros.wait_for(lambda: "has no answer" in stack.driver.log)
+    ros.wait_for(lambda: stack.said("not configured: front_left_drive: 0x1000:0 has no answer"))  # not in the log alone
     stack.start_emulator()
     stack.effort = [1.0, 0.0] * 4
     ros.wait_for(lambda: stack.states and stack.torques().min() > 0.5)
@@ -241,6 +242,16 @@ def test_bad_input_ends_it_with_one_line(ros, parameters, complaint):
     driver = ros.start(DRIVER, *(argument for parameter in parameters for argument in ("-p", parameter)))
     assert driver.wait() == 2
     assert complaint in driver.log and "Traceback" not in driver.log
+
+
+def test_an_interface_that_python_can_does_not_have_ends_it_before_configure(ros, tmp_path):
+    content = starting_content(THESIS)
+    content["buses"][0]["interface"] = "socketcn"
+    path = tmp_path / "drives.yaml"
+    path.write_text(yaml.safe_dump(content))
+    driver = ros.start(DRIVER, "-p", f"can_file:={path}")
+    assert driver.wait() == 2
+    assert "interface 'socketcn' of bus can0 is not allowed" in driver.log and "Traceback" not in driver.log
 
 
 def test_a_bus_that_is_too_full_ends_it_with_the_arithmetic(ros, tmp_path):

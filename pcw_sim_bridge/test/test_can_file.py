@@ -45,6 +45,8 @@ REFUSED = [
     (lambda c: {**c, "rate": 5}, "rate", "at least 10"),
     (lambda c: {**c, "raet": 250}, "raet", "did you mean 'rate'"),
     (lambda c: {**c, "buses": []}, "buses", "at least one"),
+    (lambda c: {**c, "master_id": 1.5}, "master_id", "a whole number 1 to 127"),
+    (lambda c: {**c, "robot": "tidybot2"}, "robot", "the robot given is thesis"),
     (lambda c: {**c, "timeouts": {"command": 5.0}}, "timeouts.command", "at most 1"),
     (lambda c: {**c, "rate": 25}, "timeouts.command", "allowed at 25 Hz: at least 0.06 s"),
     (lambda c: {**c, "timeouts": {"watchdog": 0.005}}, "timeouts.watchdog", "at least 0.006 s"),
@@ -84,6 +86,9 @@ def test_shipped_files_are_read_and_put_their_joints_in_the_order_of_the_robot()
     reversed_file = content()
     reversed_file["joints"].reverse()
     assert can_file_from(reversed_file, THESIS) == made()
+    # Its joints have the same names: with gears and limits of another robot nothing was said.
+    with pytest.raises(DescriptionError, match="robot: 'thesis' is not allowed; the robot given is tidybot2"):
+        read_can_file("thesis_cia402", load_robot("tidybot2"))
     with pytest.raises(DescriptionError, match="did you mean 'thesis_odrive'"):
         read_can_file("thesis_odriv", THESIS)
 

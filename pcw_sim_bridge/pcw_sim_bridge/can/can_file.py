@@ -116,6 +116,7 @@ class CanFile:
     rate: float = quantity("Hz", "of torques out and positions in", default=250.0, minimum=10.0, maximum=2000.0)
     heartbeat: float = quantity("s", "between two heartbeats, either way", default=0.02, minimum=0.001, maximum=0.5)
     master_id: float = quantity("1", "CANopen node id of the computer", default=127, minimum=1, maximum=127)
+    robot: str = text("name of the robot whose drives these are; another is refused", default="")
     largest_load: float = quantity("1", "share of a bus that may be in use", default=0.9, above=0.0, maximum=1.0)
     timeouts: Timeouts = section("how long silence may last", default_factory=Timeouts)
 
@@ -175,6 +176,10 @@ def _read_list(entries: Any, key: str, kind: type[Any], defaults: Mapping[str, A
 
 
 def _check(read: CanFile, robot: RobotDescription) -> None:
+    if read.robot not in ("", robot.name):  # joints of two robots may have the same names, and other gears and limits
+        raise DescriptionError("robot", read.robot, f"the robot given is {robot.name}; allowed: the drives of this robot")
+    if read.master_id != int(read.master_id):
+        raise DescriptionError("master_id", read.master_id, "allowed: a whole number 1 to 127")
     bus_names = [bus.name for bus in read.buses]
     for i, name in enumerate(bus_names):
         if name in bus_names[:i]:

@@ -43,12 +43,24 @@ def to_frame(message: can.Message) -> Frame:
     )
 
 
+def check_interface(bus: Bus) -> None:
+    """Refuse an interface that python-can does not have.
+
+    Raises:
+        CanError: names the bus, the interface and those that there are.
+    """
+    if bus.interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise CanError(f"interface {bus.interface!r} of bus {bus.name} is not allowed; allowed, of python-can: {known}")
+
+
 def open_bus(bus: Bus) -> can.BusABC:
     """Open a bus.
 
     Raises:
         CanError: names the bus and what python-can says.
     """
+    check_interface(bus)
     try:
         opened: can.BusABC = can.Bus(
             interface=bus.interface, channel=bus.channel, **{"bitrate": int(bus.bitrate), **bus.options}

@@ -29,6 +29,7 @@ def starting_content(robot: RobotDescription, protocol: str = "cia402", **change
     return {
         "format": "pcw_can/1",
         "name": f"{robot.name}_{protocol}",
+        "robot": robot.name,
         "buses": [{"name": "can0", "interface": "virtual", "channel": "can0"}],
         "joint_defaults": defaults,
         "joints": [{"name": name, "node_id": i + 1} for i, name in enumerate(robot.joint_names)],

@@ -32,7 +32,7 @@ from pcw_description.short_collections import short_collections
 
 from ..can.can_file import on_udp, read_can_file
 from ..can.can_robot import ENABLE_TIME, CanRobot, TimedReading
-from ..can.python_can import PythonCanTransport, check_log_suffix, free_log_name
+from ..can.python_can import PythonCanTransport, check_interface, check_log_suffix, free_log_name
 from ..can.supervisor import Fault
 from .joint_command_messages import read_joint_command
 
@@ -74,12 +74,15 @@ class CanDriverNode(RobustLifecycleNode):
         self.robot, self._file = robot, read_can_file(name, robot)
         if port:
             self._file = on_udp(self._file, port)
+        for bus in self._file.buses:
+            check_interface(bus)
         self._joint_index = {name: i for i, name in enumerate(robot.joint_names)}
         self._message = JointState(name=list(robot.joint_names))
         self._can: CanRobot | None = None
         self._thread: threading.Thread | None = None
         self._running = self._active = self._topics = False
         self._told: list[str] = []
+        self._not_configured = ""  # why not
         self._reading_times: OrderedDict[int, float] = OrderedDict()
         self._problems = Problems(self)
         CanRobot(robot, self._file, _NoTransport())  # refuses a bus that is too full before anything else happens
@@ -107,6 +110,7 @@ class CanDriverNode(RobustLifecycleNode):
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Open the buses and set up every drive."""
         self._make_topics()
+        self._not_configured = ""
         try:
             log = free_log_name(self._log_path) if self._log_path else None
             transport = PythonCanTransport(self._file.buses, log=log)
@@ -115,6 +119,7 @@ class CanDriverNode(RobustLifecycleNode):
             self._can.configure()
         except PcwError as error:
             self.get_logger().error(f"not configured: {error}")
+            self._not_configured = "; ".join(str(error).splitlines())
             self._close_can()
             self._remove_topics()
             return FAILURE
@@ -306,7 +311,8 @@ class CanDriverNode(RobustLifecycleNode):
     def _status(self) -> Status:
         can, problems = self._can, self._problems.take()
         if can is None:
-            return Status(WARN, "not configured")
+            why = self._not_configured
+            return Status(ERROR, f"not configured: {why}") if why else Status(WARN, "not configured")
         counters = can.counters
         median, p99, p999, largest = (1000.0 * can.age_quantiles()).tolist()
         level, message = OK, can.state
