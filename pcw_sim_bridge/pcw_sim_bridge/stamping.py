@@ -28,6 +28,16 @@ BURST_LENGTH = 3.0  # L, messages
 LARGEST_JITTER = 0.1  # [s]
 LARGEST_LOSS = 0.5
 NANOSECONDS = 1_000_000_000
+CLOCK_SET_BACK = 0.1  # a stamp further back than this is of a clock that was set, and not of a reading that came late [s]
+
+
+def stamp_after(last_ns: int, time_ns: int) -> int:
+    """Return the stamp [ns] of a reading of hardware: its time, or just after the last stamp where that is later.
+
+    Where the computer's clock was set back it is the time all the same: stamps just after the last would nearly stand until
+    the clock has made up for it, and whoever takes dt from them would compute with a nanosecond. Back in time they begin anew.
+    """
+    return time_ns if time_ns < last_ns - CLOCK_SET_BACK * NANOSECONDS else max(time_ns, last_ns + 1)
 
 
 @dataclasses.dataclass(frozen=True)

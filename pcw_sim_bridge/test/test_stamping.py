@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pcw_description import load_robot
 from pcw_sim_bridge.plants.plant import PlantError
-from pcw_sim_bridge.stamping import BURST_LENGTH, StampingParameters, TopicStamps
+from pcw_sim_bridge.stamping import BURST_LENGTH, StampingParameters, TopicStamps, stamp_after
 
 PERIOD_NS = 2_000_000
 THESIS = load_robot("thesis")
@@ -89,3 +89,10 @@ def test_reset_repeats():
 def test_what_cannot_be_is_refused(parameters, message):
     with pytest.raises(PlantError, match=message):
         StampingParameters(**parameters)
+
+
+def test_a_reading_that_comes_late_is_stamped_after_the_last_and_a_clock_that_is_set_back_is_followed():
+    """The CAN driver gave stamps 1 ns apart until a clock that was set back by a minute had made up for it."""
+    assert stamp_after(10**12, 10**12 + 4_000_000) == 10**12 + 4_000_000
+    assert stamp_after(10**12, 10**12) == stamp_after(10**12, 10**12 - 3_000_000) == 10**12 + 1
+    assert stamp_after(10**12, 10**12 - 60 * 10**9) == 10**12 - 60 * 10**9

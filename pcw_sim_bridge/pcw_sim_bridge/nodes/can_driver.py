@@ -34,6 +34,7 @@ from ..can.can_file import on_udp, read_can_file
 from ..can.can_robot import ENABLE_TIME, CanRobot, TimedReading
 from ..can.python_can import PythonCanTransport, check_interface, check_log_suffix, free_log_name
 from ..can.supervisor import Fault
+from ..stamping import stamp_after
 from .joint_command_messages import read_joint_command
 
 READINGS_REMEMBERED = 32  # whose commands may still come
@@ -83,6 +84,7 @@ class CanDriverNode(RobustLifecycleNode):
         self._running = self._active = self._topics = False
         self._told: list[str] = []
         self._not_configured = ""  # why not
+        self._set_back_ns = 0  # by how much this computer's clock was, until it is told
         self._reading_times: OrderedDict[int, float] = OrderedDict()
         self._problems = Problems(self)
         CanRobot(robot, self._file, _NoTransport())  # refuses a bus that is too full before anything else happens
@@ -227,8 +229,10 @@ class CanDriverNode(RobustLifecycleNode):
     def _publish(self, reading: TimedReading) -> None:
         age = time.monotonic() - reading.time
         stamp_ns = self.get_clock().now().nanoseconds - round(age * 1e9)
-        if self._reading_times and stamp_ns <= (last := next(reversed(self._reading_times))):
-            stamp_ns = last + 1  # stamps of one topic never repeat
+        if self._reading_times:
+            last_ns = next(reversed(self._reading_times))
+            stamp_ns = stamp_after(last_ns, stamp_ns)
+            self._set_back_ns = max(self._set_back_ns, last_ns - stamp_ns)
         self._reading_times[stamp_ns] = reading.time
         while len(self._reading_times) > READINGS_REMEMBERED:
             self._reading_times.popitem(last=False)
@@ -266,6 +270,9 @@ class CanDriverNode(RobustLifecycleNode):
         can = self._can
         if can is None:
             return
+        if self._set_back_ns:
+            self._problems.add(f"the clock of this computer was set back by {self._set_back_ns * 1e-9:.1f} s")
+            self._set_back_ns = 0
         faults = [str(fault) for fault in can.faults]
         if faults != self._told:
             for fault in faults[len(self._told) if faults[: len(self._told)] == self._told else 0 :]:
