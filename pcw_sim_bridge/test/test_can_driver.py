@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from pcw_description import load_robot  # noqa: E402
 from pcw_description.nodes.node_testing import RosTest  # noqa: E402
 from pcw_description.nodes.node_tools import ns_to_stamp  # noqa: E402
-from pcw_sim_bridge.can.can_file import Bus, udp_port_beside  # noqa: E402
+from pcw_sim_bridge.can.can_file import Bus, on_udp, read_can_file, udp_port_beside  # noqa: E402
 from pcw_sim_bridge.can.frame import Frame  # noqa: E402
 from pcw_sim_bridge.can.python_can import Echoes, PythonCanTransport, read_log  # noqa: E402
 from pcw_sim_bridge.can.starting_file import starting_content  # noqa: E402
@@ -123,6 +123,13 @@ def test_activate_drives_and_deactivate_stops_with_odrives(ros, tmp_path):
 def test_a_fault_stops_the_robot_by_name_and_only_the_user_starts_it_again(ros, tmp_path):
     stack = Stack(ros, tmp_path, "cia402")
     stack.drive()
+    intruder = PythonCanTransport(on_udp(read_can_file(stack.file, THESIS), stack.port).buses)
+    try:
+        intruder.send("can0", Frame(0x181, b"\x01"))  # as from a drive whose PDOs somebody has mapped anew
+    finally:
+        intruder.close()
+    ros.wait_for(lambda: stack.said("enabled; malformed frames since the last report: 1"))
+    assert stack.state() == State.PRIMARY_STATE_ACTIVE
     stack.effort = None  # the controller falls silent
     ros.wait_for(lambda: stack.said("command_timeout at joint_commands"))
     ros.wait_for(lambda: stack.state() == State.PRIMARY_STATE_INACTIVE)

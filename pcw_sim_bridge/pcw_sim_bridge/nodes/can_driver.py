@@ -84,6 +84,7 @@ class CanDriverNode(RobustLifecycleNode):
         self._running = self._active = self._topics = False
         self._told: list[str] = []
         self._not_configured = ""  # why not
+        self._refused: dict[str, int] = {}  # malformed frames by drive that have been told
         self._set_back_ns = 0  # by how much this computer's clock was, until it is told
         self._reading_times: OrderedDict[int, float] = OrderedDict()
         self._problems = Problems(self)
@@ -112,7 +113,7 @@ class CanDriverNode(RobustLifecycleNode):
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         """Open the buses and set up every drive."""
         self._make_topics()
-        self._not_configured = ""
+        self._not_configured, self._refused = "", {}
         try:
             log = free_log_name(self._log_path) if self._log_path else None
             transport = PythonCanTransport(self._file.buses, log=log)
@@ -350,11 +351,14 @@ class CanDriverNode(RobustLifecycleNode):
             parts[f"bus {name}"] = Status(OK, f"{load.load:.1%} of {load.bitrate / 1000:g} kbit/s", {"bus_load": load.load})
         for drive in can.drives:
             feedback, faults = drive.feedback, [fault for fault in can.faults if fault.where == drive.name]
-            message = "; ".join(map(str, faults)) or feedback.state.value
+            level, message = ERROR if faults else OK, "; ".join(map(str, faults)) or feedback.state.value
+            if malformed := drive.refused_frames - self._refused.get(drive.name, 0):  # why it may seem to say nothing
+                level, message = max(level, WARN), f"{message}; malformed frames since the last report: {malformed}"
+            self._refused[drive.name] = drive.refused_frames
             values = {"firmware": drive.firmware, "identity": drive.identity, "errors": ", ".join(feedback.error_names)}
             if feedback.temperature == feedback.temperature:  # NaN where the drive reports none
                 values["temperature_degC"] = f"{feedback.temperature:.1f}"
-            parts[f"drive {drive.name}"] = Status(ERROR if faults else OK, message, values)
+            parts[f"drive {drive.name}"] = Status(level, message, values)
         return parts
 
 
