@@ -264,6 +264,8 @@ class CanDriverNode(RobustLifecycleNode):
         if known is not None or stamp_ns == 0:
             return known
         age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
+        if age < -self._file.timeouts.command:
+            self._problems.add(f"commands bear stamps {-age:.1f} s ahead of this computer's clock: old ones go unnoticed")
         return time.monotonic() - age if age > self._file.timeouts.command else None
 
     def _look_after_faults(self) -> None:
