@@ -132,6 +132,8 @@ def test_an_interface_that_is_not_there_is_named(tmp_path, capsys):
         ("can_steer_zero", ["--can-file", "thesis_cia402", "--dry-run", "--duration", "1"], ["--duration 1", "5 to 600"]),
         ("can_log", ["record", "x.txt", "--can-file", "thesis_cia402"], ["x.txt", ".log, .asc, .blf"]),
         ("can_log", ["record", "x.log", "--duration", "-1"], ["--duration -1", "above 0"]),
+        ("can_log", ["record", "x.log", "--udp-port", "-5"], ["udp port -5", "at least 1"]),
+        ("can_doctor", ["--udp-port", "-5", "--no-nudge"], ["udp port -5", "at least 1"]),
         ("can_log", ["replay", "/no/such.log", "--yes"], ["/no/such.log", "cannot be read"]),
         ("can_log", ["recording", "/no/such.log", "--out", "x"], ["/no/such.log", "cannot be read"]),
     ],
@@ -186,6 +188,20 @@ def test_a_log_keeps_which_bus_a_frame_was_on_and_when(suffix, tmp_path):
     times = np.array([at for _, _, at in read]) - np.array([1.7e9 + at for _, _, at, _ in frames])
     # Of ASC python-can reads the time of its beginning to a second; within the log all are good to 10 us.
     assert np.abs(times).max() < (1.0 if suffix == ".asc" else 2e-5) and np.ptp(times) < 2e-5
+
+
+def test_a_log_of_another_can_file_is_refused_and_leaves_no_folder(tmp_path, capsys):
+    """It had become an empty recording, with exit code 0."""
+    _, _, frames = frames_of_a_run("cia402")
+    writer = FrameLogWriter(tmp_path / "run.blf", ["can0"])
+    for bus, frame, at, sent in frames:
+        writer.write(bus, frame, 1.7e9 + at, sent)
+    writer.close()
+    said = refused(
+        capsys, "can_log", "recording", tmp_path / "run.blf", "--can-file", "thesis_odrive", "--out", tmp_path / "bag"
+    )
+    assert "no whole set of joints" in said and "of nobody in thesis_odrive" in said
+    assert not (tmp_path / "bag").exists()
 
 
 def test_a_driver_that_is_configured_again_gets_a_log_of_its_own(tmp_path):

@@ -43,6 +43,7 @@ TWO_BUSES = [
 REFUSED = [
     (lambda c: {**c, "joints": c["joints"][:7]}, "joints", "missing: rear_right_steer"),
     (lambda c: {**c, "rate": 5}, "rate", "at least 10"),
+    (lambda c: {**c, "master_id": 50.5}, "master_id", "a whole number 1 to 127"),
     (lambda c: {**c, "raet": 250}, "raet", "did you mean 'rate'"),
     (lambda c: {**c, "buses": []}, "buses", "at least one"),
     (lambda c: {**c, "master_id": 1.5}, "master_id", "a whole number 1 to 127"),

@@ -404,9 +404,15 @@ def test_a_log_that_is_none_is_refused(tmp_path):
 
     with pytest.raises(CanError, match=r"\.txt"):
         list(read_log(tmp_path / "x.txt"))
-    (tmp_path / "x.blf").write_bytes(b"no")
-    with pytest.raises(CanError, match="cannot be read"):
-        list(read_log(tmp_path / "x.blf"))
+    for content in (b"no", bytes(range(256)) * 10):  # too short, and long enough to be looked at
+        for suffix in (".log", ".asc", ".blf"):
+            (tmp_path / f"x{suffix}").write_bytes(content)
+            try:
+                assert list(read_log(tmp_path / f"x{suffix}")) == []  # ASC passes over lines that it does not know
+            except CanError as error:
+                assert "cannot be read" in str(error)
+            else:
+                assert suffix == ".asc"
 
 
 def test_a_run_over_can_leaves_the_recording_that_the_bridge_would(tmp_path):

@@ -186,6 +186,8 @@ def _check(read: CanFile, robot: RobotDescription) -> None:
             raise DescriptionError(f"buses[{i}].name", name, "allowed: each name once")
         if not isinstance(read.buses[i].options, Mapping):
             raise DescriptionError(f"buses[{i}].options", read.buses[i].options, "allowed: a mapping of keys to values")
+    if read.master_id != int(read.master_id):
+        raise DescriptionError("master_id", read.master_id, "allowed: a whole number 1 to 127")
     names = [joint.name for joint in read.joints]
     for i, joint in enumerate(read.joints):
         where = f"joints[{i}]"
@@ -336,11 +338,13 @@ def on_udp(read: CanFile, port: int = UDP_PORT) -> CanFile:
     """Return the file with every bus on python-can's udp_multicast, which stays on this computer.
 
     Raises:
-        CanError: the last bus would have a port beyond the largest.
+        CanError: a port that is none, or of the last bus beyond the largest.
     """
     largest = 65535 - NEXT_BUS * (len(read.buses) - 1)
-    if port > largest:
-        raise CanError(f"udp port {port} is not allowed; allowed: at most {largest}, each bus has one {NEXT_BUS} further on")
+    if not 0 < port <= largest:
+        raise CanError(
+            f"udp port {port} is not allowed; allowed: at most {largest} and at least 1, each bus has one {NEXT_BUS} further on"
+        )
     buses = [
         dataclasses.replace(
             bus,

@@ -12,7 +12,7 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pcw_description.errors import PcwError
@@ -25,7 +25,7 @@ from .command_line import end_on_signals
 from .drive_set import make_drives
 from .errors import CanError
 from .frame import Frame
-from .frame_log import FrameDecoder, frames_of_file, write_joint_topics
+from .frame_log import DecodedStates, FrameDecoder, frames_of_file, write_joint_topics
 from .transport import TransmitBufferFull, Transport
 
 SENDERS = ("all", "drives", "computer")
@@ -94,22 +94,29 @@ def make_recording(log: Path, robot: RobotDescription, file: CanFile, out: Path)
     """Make a recording of a log; returns a line on what was written.
 
     Raises:
-        CanError, RecordingError: a log that cannot be read, or a folder that exists.
+        CanError, RecordingError: a log that cannot be read or says nothing of the joints, or a folder that exists.
     """
     from .python_can import read_log
 
+    _look_for_joints(frames_of_file(read_log(log), file), log, FrameDecoder(robot, file), file)
     decoder = FrameDecoder(robot, file)
-    frames = frames_of_file(read_log(log), file)
-    beginning = next(frames, None)  # a log that cannot be read leaves no folder
-    if beginning is None:
-        raise CanError(f"log {log} holds no frame; allowed: a log with frames")
     with RecordingWriter(out, flush_interval=None) as writer:
-        write_joint_topics(writer, robot, decoder, itertools.chain([beginning], frames))
+        write_joint_topics(writer, robot, decoder, frames_of_file(read_log(log), file))
         counts = dict(writer.counts)
-    said = (
-        ", ".join(f"{count} {topic.strip('/')}" for topic, count in counts.items()) or "nothing, as no set of joints was whole"
-    )
+    said = ", ".join(f"{count} {topic.strip('/')}" for topic, count in counts.items())
     return f"{out}: {said}; {decoder.foreign} frames of nobody in {file.name}"
+
+
+def _look_for_joints(frames: Iterable[tuple[str, Frame, float]], log: Path, decoder: FrameDecoder, file: CanFile) -> None:
+    """Refuse a log without one whole set of joints, before a folder is made: it is mostly that of another CAN file."""
+    count = 0
+    for count, (bus, frame, at) in enumerate(frames, 1):
+        if isinstance(decoder.take(bus, frame, at), DecodedStates):
+            return
+    raise CanError(
+        f"log {log} holds no whole set of joints: of {count} frames {decoder.foreign} are of nobody in {file.name}; "
+        "allowed: a log that was made with this CAN file"
+    )
 
 
 def _record(log: Path, file: CanFile, duration: float | None) -> str:
