@@ -343,7 +343,7 @@ def on_udp(read: CanFile, port: int = UDP_PORT) -> CanFile:
     largest = 65535 - NEXT_BUS * (len(read.buses) - 1)
     if not 0 < port <= largest:
         raise CanError(
-            f"udp port {port} is not allowed; allowed: at most {largest} and at least 1, each bus has one {NEXT_BUS} further on"
+            f"udp port {port} is not allowed; allowed: at most {largest}, at least 1; each bus has one {NEXT_BUS} further on"
         )
     buses = [
         dataclasses.replace(

@@ -110,7 +110,8 @@ def make_recording(log: Path, robot: RobotDescription, file: CanFile, out: Path)
 def _look_for_joints(frames: Iterable[tuple[str, Frame, float]], log: Path, decoder: FrameDecoder, file: CanFile) -> None:
     """Refuse a log without one whole set of joints, before a folder is made: it is mostly that of another CAN file."""
     count = 0
-    for count, (bus, frame, at) in enumerate(frames, 1):
+    for bus, frame, at in frames:
+        count += 1
         if isinstance(decoder.take(bus, frame, at), DecodedStates):
             return
     raise CanError(
