@@ -202,6 +202,29 @@ def test_a_message_that_no_longer_comes_is_missed_though_positions_come(protocol
     assert torques(driven) == 0.0
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_drive_that_is_missing_ends_the_readings_until_it_speaks(protocol):
+    """They had gone on at their rate with the last position and speed of the drive, like those of a robot that moves."""
+    driven, times = driving(protocol), []
+
+    def answer(reading):
+        times.append(driven.transport.now())
+        driven.answer(reading)
+
+    driven.emulated.inject("dead", "front_left_drive")
+    begun = driven.transport.now()
+    for _ in range(100):
+        driven.can.cycle(answer)
+    assert names(driven) == ["missing_node"]
+    assert 0.02 < times[-1] - begun < driven.can.file.timeouts.feedback + 2.0 * driven.can.period
+    driven.emulated.inject("heal", "front_left_drive")
+    driven.can.clear_faults()
+    times.clear()
+    for _ in range(10):
+        driven.can.cycle(answer)
+    assert len(times) == 10
+
+
 @pytest.mark.parametrize("answers", [False, True])
 def test_drives_that_cannot_be_set_up_again_leave_a_fault(answers):
     """None was left: the driver looked healthy, and `activate` asked for a configure that an inactive node does not have."""

@@ -474,7 +474,8 @@ class CanRobot:
         if not published and self._reading is not None:
             self.counters.incomplete += 1
             self._follow(1.0)  # away from the end of the period, on one side of which the last of the set must be
-            self._publish(on_reading, complete=False)
+            if not self._is_silent():
+                self._publish(on_reading, complete=False)
 
     def _follow(self, late: float) -> None:
         """Shift the next period so that sets are whole in its middle; late: of this one, in periods.
@@ -498,6 +499,11 @@ class CanRobot:
     def _is_complete(self) -> bool:
         since, now = self._published_time, self.transport.now()
         return all(newer_than(drive.feedback, since, now, self.period) for drive in self.drives)
+
+    def _is_silent(self) -> bool:
+        """Whether a drive has said nothing for so long that it is missing: what it said before is no reading of now."""
+        newest = (min(f.position_time, f.velocity_time, f.torque_time) for f in (drive.feedback for drive in self.drives))
+        return self.transport.now() - min(newest) > self.file.timeouts.feedback
 
     def _publish(self, on_reading: OnReading | None, complete: bool) -> None:
         with self._lock:
