@@ -5,6 +5,7 @@ Timeouts are long: these tests share a computer with others. How fast faults are
 
 import json
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("can")
 pytest.importorskip("msgpack", reason="udp_multicast of python-can needs it")
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
@@ -27,6 +28,9 @@ from pcw_sim_bridge.can.can_file import Bus, on_udp, read_can_file, udp_port_bes
 from pcw_sim_bridge.can.frame import Frame  # noqa: E402
 from pcw_sim_bridge.can.python_can import Echoes, PythonCanTransport, read_log  # noqa: E402
 from pcw_sim_bridge.can.starting_file import starting_content  # noqa: E402
+from pcw_sim_bridge.can.supervisor import Fault  # noqa: E402
+from pcw_sim_bridge.can.trial_rig import Rig  # noqa: E402
+from pcw_sim_bridge.nodes.can_driver import CanDriverNode  # noqa: E402
 
 DRIVER, EMULATOR = "pcw_sim_bridge.nodes.can_driver", "pcw_sim_bridge.can.drive_emulator"
 THESIS = load_robot("thesis")
@@ -270,6 +274,18 @@ def test_a_bus_that_is_too_full_ends_it_with_the_arithmetic(ros, tmp_path):
     driver = ros.start(DRIVER, "-p", f"can_file:={path}")
     assert driver.wait() == 2
     assert "8 x   500.0 Hz x 125 bit" in driver.log and "Traceback" not in driver.log
+
+
+def test_a_bus_that_is_off_says_so_in_its_own_status():
+    """It had been well, with its load, beside drives that were missing."""
+    driven = Rig(THESIS, read_can_file("thesis_cia402", THESIS))
+    driven.can.configure()
+    driven.can.stop([Fault("bus_off", "can0", "the interface has left the bus")])
+    node = SimpleNamespace(_can=driven.can, _refused={})
+    bus = CanDriverNode._parts(node)["bus can0"]
+    assert bus.level == DiagnosticStatus.ERROR and "bus_off at can0" in bus.message and "%" in bus.message
+    driven.can.clear_faults()
+    assert CanDriverNode._parts(node)["bus can0"].level == DiagnosticStatus.OK
 
 
 # --- python-can --------------------------------------------------------------------------------------------

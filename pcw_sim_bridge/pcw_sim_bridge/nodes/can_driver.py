@@ -350,10 +350,12 @@ class CanDriverNode(RobustLifecycleNode):
             return {}
         parts = {}
         for name, load in can.loads.items():
-            parts[f"bus {name}"] = Status(OK, f"{load.load:.1%} of {load.bitrate / 1000:g} kbit/s", {"bus_load": load.load})
+            faults = [str(fault) for fault in can.faults if fault.where == name]
+            message = "; ".join([f"{load.load:.1%} of {load.bitrate / 1000:g} kbit/s", *faults])
+            parts[f"bus {name}"] = Status(ERROR if faults else OK, message, {"bus_load": load.load})
         for drive in can.drives:
-            feedback, faults = drive.feedback, [fault for fault in can.faults if fault.where == drive.name]
-            level, message = ERROR if faults else OK, "; ".join(map(str, faults)) or feedback.state.value
+            feedback, faults = drive.feedback, [str(fault) for fault in can.faults if fault.where == drive.name]
+            level, message = ERROR if faults else OK, "; ".join(faults) or feedback.state.value
             if malformed := drive.refused_frames - self._refused.get(drive.name, 0):  # why it may seem to say nothing
                 level, message = max(level, WARN), f"{message}; malformed frames since the last report: {malformed}"
             self._refused[drive.name] = drive.refused_frames
